@@ -218,7 +218,7 @@ def of_angular_rate() -> Iterator[Fault]:
     gyro = r"angular rate|gyro"
     yield row("stuck", FROM, FROM_S, stuck("imu_s", "rate"), r"angular rate.*same|gyro")
     imu_late = late("imu_s")
-    yield row("late", "seconds, of all IMU rows", (0.5, 1.0, 1.5), imu_late, r"DVL against IMU", roles=roles("imu", "dvl"))
+    yield row("late", "seconds, of all IMU rows", (0.5, 1.0, 1.5), imu_late, r"DVL against IMU|those of the IMU too", roles=roles("imu", "dvl"))
     yield row(SENSE, NEGATED, AGAIN, one_axis_negated("rate"), gyro)
     yield row(SENSE, "x and z exchanged", AGAIN, turned("rate", X_Z), gyro)
     yield row("unit", "degrees", (DEGREE, DEGREE, DEGREE), scaled("rate"), r"gyro.*degrees")
@@ -250,13 +250,13 @@ def of_velocity() -> Iterator[Fault]:
     either = roles("dvl", "imu")  # of a turn about the vertical, which the pair alone does not tell apart
     for name, axes in MIRRORS.items():
         may_change = either if name == "x and y negated" else roles("dvl")
-        yield row(SENSE, name, AGAIN, turned("velocity", axes), r"DVL axes", roles=may_change)
+        yield row(SENSE, name, AGAIN, turned("velocity", axes), r"DVL axes|Doppler log has the wrong sense", roles=may_change)
     quarter = turned("velocity", QUARTER_TURN)
     yield row(SENSE, "turned by 90 degrees", AGAIN, quarter, r"DVL axes|mounting yaw", roles=either)
     yield row("marked invalid", "share, huge variance", SHARES, Marked("velocity", "dvl_s", "velocity", True), LEFT_OUT)
     yield row("marked invalid", "share, NaN", SHARES, Marked("velocity", "dvl_s", "velocity", False), LEFT_OUT)
     row = partial(row, roles=roles("dvl", "positions", "detections", "depth"))
-    scale = r"DVL.*(unit|scale)|Doppler log.s scale|scale of the Doppler"
+    scale = r"DVL.*(unit|scale)|Doppler log.s scale|scale of the Doppler|knots of the Doppler"
     yield row("unit", "mm/s, cm/s, knots", (1e3, 1e2, 1 / 0.5144), scaled("velocity"), scale)
     yield row("scale", "factor", (1.1, 0.9, 1.2), scaled("velocity"), scale)
 

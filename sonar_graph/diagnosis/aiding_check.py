@@ -93,6 +93,8 @@ LARGEST_SCATTER = 10.0
 """Scatter in sigmas, from which on a sensor contradicts beyond doubt: normalised squares of 100."""
 GRAVE_ERROR = 5.0
 """Error by a scale or a lag, in sigmas of a row, from which on results are doubtful."""
+GRAVE_SCALE = 0.1
+"""Error of a scale that no sensor has which works."""
 CLIMB_S = 40.0
 """Time in which a vehicle climbs or dives by much more than the Doppler log's noise adds up to."""
 FEWEST_DEPTHS = 30
@@ -105,6 +107,8 @@ LENGTHS = {
     "km": 1e3,
 }
 PRESSURES = {"kPa as Pa": 1e3, "hPa as Pa": 1e2, "dbar as Pa": 1e4, "bar as Pa": 1e5}
+KNOTS = "knots of the Doppler log"
+KNOTS_LINE = f"`scale = 0.5144` under [dvl] {IN_LOG_CONFIG}"
 MINUTES = "degrees and minutes written as 12.3456"
 DEGREES = {"degrees": float(np.radians(1.0))}
 
@@ -324,7 +328,7 @@ POSITIONS = Check(
     slow_sigma=lambda sequence: (
         0.1 * level_sigma_m(sequence.calibration.positions.sigma_m)
     ),
-    units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6},
+    units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda config: Advice(
         "north and east are exchanged",
         f"{other_world(config, 'positions')}, or the fields of position in another order",
@@ -338,6 +342,7 @@ POSITIONS = Check(
     other_lines={
         "degrees": f"`geodetic`, with the fields of latitude and longitude, under [positions] {IN_LOG_CONFIG}",
         MINUTES: "write them as decimal degrees",
+        KNOTS: KNOTS_LINE,
     },
     causes=(OF_FIXES,),
     step_unit="m",
@@ -347,13 +352,15 @@ RANGE = SIGHTINGS(
     name="ranges to landmarks",
     compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=True),
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
-    units=LENGTHS | {"the way there and back": 0.5, "half of the range": 2.0},
+    units=LENGTHS
+    | {"the way there and back": 0.5, "half of the range": 2.0, KNOTS: 1 / 0.5144},
+    other_lines={KNOTS: KNOTS_LINE},
     scale_key="range_scale",
     # landmarks are wrong by the error of the whole range, not of its changes
     reach=lambda sequence, _: typical_sighting(sequence)[0],
     causes=(OF_RANGES, SONAR_TURN),
     sense=lambda _: Advice(
-        "they grow where the vehicle approaches: the sonar looks backwards?",
+        "they grow where the vehicle approaches: the sonar looks backwards, or the Doppler log has the wrong sense?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}, its yaw changed by 3.1416",
     ),
     scaled=lambda config, gain: Advice(
@@ -457,16 +464,16 @@ class SensorComparison:
         return self.check.is_sighting and is_wheeled
 
     @property
-    def unit(self) -> str:
-        """The unit that the gain looks like, within its interval; empty: none."""
+    def units(self) -> list[str]:
+        """The units that the gain looks like, within its interval, the nearest one first."""
         size = max(self.size, 1e-12)
         near = {
             unit: abs(np.log(size * factor))
             for unit, factor in self.check.units.items()
         }
-        unit = min(near, key=near.__getitem__, default="")
         tolerance = max(UNIT_TOLERANCE, ACTING_SIGMAS * self.found.gain.sigma / size)
-        return unit if unit and near[unit] < min(tolerance, MOST_UNIT_TOLERANCE) else ""
+        most = min(tolerance, MOST_UNIT_TOLERANCE)
+        return sorted((u for u in near if near[u] < most), key=near.__getitem__)
 
     def contradiction(self, cause: str, line: str) -> Finding:
         """The row of the gain with a cause."""
@@ -476,7 +483,7 @@ class SensorComparison:
         """No change where the reference has some; a wrong unit may make a gain small too."""
         moved = self.found.moved
         is_flat = self.size + 4 * self.found.gain.sigma < HARDLY
-        if not is_flat or self.unit or moved <= STUCK_MOVED * self.sigma:
+        if not is_flat or self.units or moved <= STUCK_MOVED * self.sigma:
             return None
         verb = "turns" if self.check is HEADING else "changes"
         return self.contradiction(
@@ -508,7 +515,7 @@ class SensorComparison:
 
     def of_cause(self) -> Finding | None:
         """A cause of the check's own; a gain that is a unit has another one only where that fits better."""
-        most = 1 / AS_GOOD if self.unit else AS_GOOD
+        most = 1 / AS_GOOD if self.units else AS_GOOD
         known = self.sequence.calibration
         return cause_of(self.check.name, self.check.causes, self.found, known, most)
 
@@ -521,16 +528,17 @@ class SensorComparison:
         is_sure = matters(replace(found.gain, value=size - 1.0), 0.0)
         if not is_sure or 1 / most < size < most or found.misfit > MOST_MISFIT:
             return None
-        unit = self.unit
-        if not unit and size < 1 and self.is_late:
+        units = self.units
+        if not units and size < 1 and self.is_late:
             return self.contradiction(
                 f"it follows {check.against} {found.lag.value:.2g} s late and {size:.2g} times as far: smoothed by the "
                 "sensor or its driver",
                 unused(check.role),
             )
-        times = 1.0 / check.units[unit] if unit else size
+        unit = units[0] if units else "another unit"
+        times = 1.0 / check.units.get(unit, 1.0 / size)
         return self.contradiction(
-            f"it changes {size:.3g} times as much as by {check.against}: {unit or 'another unit'}?",
+            f"it changes {size:.3g} times as much as by {check.against}: {' or '.join(units) or unit}?",
             check.other_lines.get(unit)
             or scale_line(check.role, check.scale_key, self.config, times),
         )
@@ -570,7 +578,9 @@ class SensorComparison:
                 cause=f"it changes {size:.3g} times as much",
                 consequence=f"up to {error:.2g}",
                 line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
-                gravity=self.gravity(error),
+                gravity=Gravity.GRAVE
+                if abs(off.value) > GRAVE_SCALE
+                else self.gravity(error),
             )
         # wheels start to slip in turns: no delay of a sensor
         if not self.found.lag.is_known or self.slips:
@@ -591,9 +601,12 @@ class SensorComparison:
         error = abs(lag.value) * self.found.rate
         if not matters(known, check.least_lag_s) or error < self.sigma:
             return row
+        late, early = ("late", "early") if lag.value > 0 else ("early", "late")
+        # the gyros are the reference of angles
+        of_imu = f", or those of the IMU too {early}" if check.is_angle else ""
         return replace(
             row,
-            cause=f"its rows come too {'late' if lag.value > 0 else 'early'}",
+            cause=f"its rows come too {late}{of_imu}",
             consequence=f"an error of {error:.2g} typically",
             line=shift_line(check.role, self.config, -lag.value),
             gravity=self.gravity(error),

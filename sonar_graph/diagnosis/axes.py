@@ -44,6 +44,8 @@ MOST_MISFIT = 0.05
 """Largest share of the squares of the accelerations that the best matrix leaves."""
 OTHER_MATRIX = 10.0
 """Least ratio of the sums of squares as they are and at the best matrix, for a matrix that is no permutation."""
+LEAST_FREEDOM = 27
+"""Three differences for each entry of a matrix that is no permutation."""
 MOST_LEFT = 1.6
 """Largest ratio of the sum of squares at the best candidate and with any matrix: beyond it no candidate fits."""
 
@@ -126,6 +128,8 @@ def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
     Such as those of a log in knots, or of one that looks down and is turned by 45 degrees. A matrix that is neither, and
     leaves little, mixes axes, as velocities along beams are mixed.
     """
+    if rows.freedom < LEAST_FREEDOM:
+        return AxesMatch.as_read()
     Q = rows.quadratic_form(np.eye(3))
     least = least_of(Q)
     as_read = square_of(Q, np.eye(3))

@@ -92,6 +92,15 @@ def of_current(stretch: SignalStretch) -> Values:
     return np.column_stack([since_middle(stretch), x])
 
 
+def of_current_beside_scale(stretch: SignalStretch) -> Values:
+    """What the table of checks has beside the reference, and the reference itself, shape (n, q + 1).
+
+    On a straight way a current along it and a scale are the same.
+    """
+    x = stretch.shifted(np.zeros(1))[0]
+    return np.column_stack([of_way(stretch), x])
+
+
 def of_scale(stretch: SignalStretch) -> Values:
     """Changes of ranges themselves, and what heights of landmarks take off them, shape (n, 2)."""
     x = stretch.shifted(np.zeros(1))[0]
@@ -222,7 +231,7 @@ CURRENT = partial(
     Cause, "current", "m/s", least=lambda _: LEAST_CURRENT_M_S, advice=current_advice
 )
 OF_FIXES = CURRENT(columns=of_current, wanted=1)
-OF_RANGES = CURRENT(columns=of_way, wanted=2)
+OF_RANGES = CURRENT(columns=of_current_beside_scale, wanted=2)
 
 
 def cause_of(
