@@ -218,7 +218,8 @@ def of_angular_rate() -> Iterator[Fault]:
     gyro = r"angular rate|gyro"
     yield row("stuck", FROM, FROM_S, stuck("imu_s", "rate"), r"angular rate.*same|gyro")
     imu_late = late("imu_s")
-    yield row("late", "seconds, of all IMU rows", (0.5, 1.0, 1.5), imu_late, r"DVL against IMU|those of the IMU too", roles=roles("imu", "dvl"))
+    words = r"DVL against IMU|those of the IMU too"
+    yield row("late", "seconds, of all IMU rows", (0.5, 1.0, 1.5), imu_late, words, roles=roles("imu", "dvl"))
     yield row(SENSE, NEGATED, AGAIN, one_axis_negated("rate"), gyro)
     yield row(SENSE, "x and z exchanged", AGAIN, turned("rate", X_Z), gyro)
     yield row("unit", "degrees", (DEGREE, DEGREE, DEGREE), scaled("rate"), r"gyro.*degrees")
@@ -248,9 +249,10 @@ def of_velocity() -> Iterator[Fault]:
     yield row("stuck", FROM, FROM_S, stuck("dvl_s", "velocity"), r"(velocity|DVL).*(same|stuck|repeat)")
     yield row("late", "seconds", (0.5, 1.0, 1.5), late("dvl_s"), r"DVL against IMU")
     either = roles("dvl", "imu")  # of a turn about the vertical, which the pair alone does not tell apart
+    words = r"DVL axes|Doppler log has the wrong sense"
     for name, axes in MIRRORS.items():
         may_change = either if name == "x and y negated" else roles("dvl")
-        yield row(SENSE, name, AGAIN, turned("velocity", axes), r"DVL axes|Doppler log has the wrong sense", roles=may_change)
+        yield row(SENSE, name, AGAIN, turned("velocity", axes), words, roles=may_change)
     quarter = turned("velocity", QUARTER_TURN)
     yield row(SENSE, "turned by 90 degrees", AGAIN, quarter, r"DVL axes|mounting yaw", roles=either)
     yield row("marked invalid", "share, huge variance", SHARES, Marked("velocity", "dvl_s", "velocity", True), LEFT_OUT)

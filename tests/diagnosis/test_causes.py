@@ -9,7 +9,13 @@ import pytest
 
 from sonar_graph.calibration import Calibration, PositionCalibration
 from sonar_graph.diagnosis import check_sensors
-from sonar_graph.measurements import Depth, Floats, Heading, PositionFixes
+from sonar_graph.measurements import (
+    Depth,
+    Floats,
+    Heading,
+    LandmarkDetections,
+    PositionFixes,
+)
 from sonar_graph.sequence import Sequence
 
 from .test_turn_rate import T, level_drive
@@ -137,6 +143,48 @@ def test_velocities_that_jump_without_a_force_have_lost_the_bottom():
     assert found.quantity == "DVL: steps"
     times_s = [float(text) for text in re.findall(r"at ([0-9.]+) s", found.cause)]
     assert times_s == pytest.approx([20.2, 40.0], abs=0.4)
+
+
+def straight(scale: float) -> Sequence:
+    """A straight way at 0.9 m/s past landmarks on both sides, with a scale of the Doppler log."""
+    run = level_drive(0)
+    seconds = np.arange(1.0, 50.0)
+    x_m, y_m = np.meshgrid(np.arange(5.0, 65.0, 10.0), [-6.0, 4.0])
+    ahead_m = x_m.ravel() - 0.9 * seconds[:, None]  # (frames, landmarks)
+    aside_m = np.broadcast_to(y_m.ravel(), ahead_m.shape)
+    seen = np.argwhere(ahead_m > 1.0)
+    range_m = np.hypot(ahead_m, aside_m)[tuple(seen.T)]
+    n = len(seen)
+    rest = np.zeros((len(T), 3))
+    imu = replace(
+        run.imu,
+        angular_velocity=rest + 1e-4 * NOISE,
+        specific_force=rest + [0.0, 0.0, 9.80665] + 1e-2 * NOISE,
+    )
+    velocity = np.tile([0.9 * scale, 0.0, 0.0], (len(run.dvl.stamps_ns), 1))
+    return replace(
+        run,
+        imu=imu,
+        dvl=replace(run.dvl, velocity=velocity),
+        detections=LandmarkDetections(
+            stamps_ns=run.imu.stamps_ns[0]
+            + np.rint(seconds[seen[:, 0]] * 1e9).astype(np.int64),
+            range_m=range_m + 0.02 * NOISE[:n, 0],
+            azimuth_rad=np.arctan2(aside_m, ahead_m)[tuple(seen.T)]
+            + 0.005 * NOISE[:n, 1],
+            range_azimuth_cov=np.full((n, 2, 2), np.nan),
+            candidate_ids=seen[:, 1:].astype(np.int64),
+            id_probability=np.ones((n, 1)),
+        ),
+    )
+
+
+def test_ranges_on_a_straight_way_blame_the_scale_and_no_current():
+    assert not [f.quantity for f in check_sensors(straight(1.0)) if f.acts]
+    (found,) = (f for f in check_sensors(straight(1.2)) if f.acts)
+    assert found.quantity.startswith("ranges to landmarks: change")
+    assert "range_scale" in found.line
+    assert "the scale of the Doppler log" in found.line
 
 
 def test_right_sensors_have_no_cause():
