@@ -257,6 +257,8 @@ def lost(sequence: Sequence) -> Sequence:
         update={
             "position_m": (-400.0, 700.0, start.position_m[2]),
             "rpy_rad": (roll, pitch, 0.0),
+            "position_sigma_m": (SURE, SURE, SURE),
+            "rpy_sigma_rad": (SURE, SURE, SURE),
             "source": "map",
         }
     )
@@ -490,7 +492,7 @@ def robots(folder: Path, case: tuple[int, int]) -> dict[str, Figures]:
     found = {}
     for name in ESTIMATORS:
         found[name] = in_map(name, unsure, known)
-        located = run(name, lost(second, robot), known)
+        located = run(name, lost(second), known)
         found[name]["lost_m"] = located.rms_m
         waited_ns = located.stamps_ns[0] - second.start_ns
         found[name]["waited_s"] = float(waited_ns * 1e-9)
