@@ -1,3 +1,4 @@
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from tests.recorded_batches import (
     changed,
     drawn_batch,
     failed,
+    updated,
     with_failures,
     without,
 )
@@ -98,3 +100,21 @@ def test_a_run_that_fails_now_or_lost_a_score_does_not_pass_and_says_why(
         verdict = judged(before, after, tmp_path)
         assert verdict.passed
         assert not verdict.look_at
+
+
+def slower(batch: RecordedBatch, factor: float) -> RecordedBatch:
+    """The batch, on a machine that takes so many times as long."""
+    timed = updated(batch, lambda run: {"time.total_s": factor * (3 + 0.1 * run.seed)})
+    return replace(timed, metrics=[ATE, "time.total_s"])
+
+
+def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_path):
+    path = tmp_path / "reference.json"
+    bless(slower(batch, 1.0), path)
+    assert "time.total_s" not in path.read_text()
+    content = json.loads(path.read_text())
+    content["metrics"].append("time.total_s")
+    for entry, run in zip(content["runs"], slower(batch, 1.0).runs, strict=True):
+        entry["scores"]["time.total_s"] = run.values["time.total_s"]
+    path.write_text(json.dumps(content))
+    assert gate(slower(batch, 4.0), path).passed

@@ -12,10 +12,12 @@ from sonar_graph.batch.sources import KINDS, LogOptions, SourceKind, fingerprint
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation import compare, read_comparison
+from sonar_graph.evaluation import compare, read_comparison, run_here
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
     BasinOptions,
+    LandmarkOptions,
+    add_landmarks,
     simulate_basin,
 )
 
@@ -149,3 +151,25 @@ def test_other_versions_than_planned_give_no_result(planned, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         perform(run, tmp_path / "file")
+
+
+def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch):
+    log = log_with_duration(tmp_path, monkeypatch, 120)
+    run = replace(of_log(planned(), log), landmarks={}, seed=1)
+    used: list[Sequence] = []
+
+    def noted(sequence: Sequence, *given: Any, **named: Any) -> Any:
+        used.append(sequence)
+        return run_here(sequence, *given, **named)
+
+    monkeypatch.setattr(one_run, "run_here", noted)
+    assert perform(run, tmp_path / "run")["status"] == "ok"
+    recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
+    expected, other = (
+        add_landmarks(recorded, LandmarkOptions(seed=seed)) for seed in (1, 0)
+    )
+    assert map_of(used[0]) == map_of(expected) != map_of(other)
+
+
+def map_of(sequence: Sequence) -> list[list[float]]:
+    return sequence.true_landmarks.positions.tolist()

@@ -408,3 +408,45 @@ def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> N
         run = replace(run, depth=replace(run.depth, z_m=z_m))
     found = [f.quantity for f in coarse_findings(run)]
     assert found == ([] if sensor == "none" else [f"{sensor}: resolution"])
+
+
+def test_usual_readings_raise_no_doubt_about_units():
+    """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
+    assert not units(speed=19.9, turn=1.99, force=9.0)
+    for force in (0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6):
+        assert not units(force=force), "gravity in no unit"
+    (fault,) = units(force=0.78, gravity=9.1)
+    assert "instead of 9.1 m/s²: g?" in fault.advice
+    (fault,) = units(force=np.where(np.arange(N) < 40, 20.0, 1.0))
+    assert "typically 1 instead" in fault.advice
+    (fault,) = units(turn=2.1)
+    assert fault.advice.startswith(
+        "rates look 57 times too large (up to 2.1 rad/s): degrees a second? "
+    )
+
+
+@pytest.mark.parametrize("acts", [True, False])
+def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
+    offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
+    numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
+    match = DvlMatch(
+        *numbers,
+        lever=told(-0.2, 0.0, -0.15),
+        gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6),
+    )
+    turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
+    rows = list(sensor_check.dvl_findings(match, turned, LogConfig()))
+    assert [row.acts for row in rows] == [acts] * 3
+    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), (
+        "that of a sample's instant"
+    )
+    right = sensor_check.corrected_sequence(turned, match, rows)
+    assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(
+        400_000_000 if acts else 0
+    )
+    assert right.dvl.velocity == pytest.approx(
+        RIGHT.dvl.velocity * (1.04 if acts else 1.0)
+    )
+    assert right.calibration.dvl.mounting.rpy_rad == pytest.approx(
+        (0.3, 0.1, 0.25 if acts else 0.2)
+    )

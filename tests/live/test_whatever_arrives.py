@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
-from sonar_graph.live import Message, definition_of
+from sonar_graph.live import Engine, Message, definition_of
+from sonar_graph.live.engine import OVERLOADED
+from sonar_graph.live.live_messages import dropped_messages
+from sonar_graph.logs import LiveRecord
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import encode, parse_definition
 from sonar_graph.testing import small_world
@@ -368,3 +371,61 @@ def test_what_is_waited_for_is_said_once(tmp_path, messages):
         <= 4
     )
     assert not engine.waits_for
+
+
+def test_detections_that_were_dropped_for_being_behind_are_counted_once(
+    tmp_path, messages
+):
+    """Also where all began anew before, with a sensor that came late."""
+    late = [
+        m
+        for m in messages
+        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
+    ]
+    with LiveRecord(tmp_path / "first.mcap") as record:
+        engine = Engine(record, definition_of)
+        for message in late:
+            engine.take(message)
+            for step in engine.steps():
+                if engine.generation == 1:
+                    engine.without_detections(step, message.arrival_ns)
+    dropped = dropped_messages(tmp_path / "first.mcap")
+    assert engine.counts.dropped == {(DETECTIONS, OVERLOADED): len(dropped)}
+    assert dropped
+
+
+def test_rows_that_are_sound_count_beside_others_that_are_not(tmp_path, messages):
+    """One range of two that is not a number does not cost the other."""
+    stamps = doppler_stamps(messages)
+    half = [detections(at, 1) for at in stamps]
+    half = [
+        m._replace(
+            payload=m.payload.replace(struct.pack("<d", 6.0), struct.pack("<d", np.nan))
+        )
+        for m in half
+    ]
+    engine, steps = live(
+        tmp_path / "record.mcap", in_order(without(messages, DETECTIONS) + half)
+    )
+    assert (
+        sum(len(step.detections) for step in steps if step.detections is not None) > 90
+    )
+    assert_equal(engine, steps, tmp_path / "record.mcap")
+
+
+def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_came(
+    tmp_path, messages
+):
+    first_ns = messages[0].arrival_ns
+    late = [
+        m for m in messages if m.topic != DETECTIONS or m.arrival_ns > first_ns + 9 * NS
+    ]
+    second = [
+        m._replace(topic="/dvl2/data")
+        for m in messages
+        if m.topic == DVL and m.arrival_ns > first_ns + 5 * NS
+    ]
+    engine, steps = live(tmp_path / "record.mcap", in_order(late + second))
+    assert engine.generation == 1
+    assert any(step.detections is not None for step in steps)
+    assert_equal(engine, steps, tmp_path / "record.mcap")

@@ -18,7 +18,8 @@ from sonar_graph.recognition import (
     recognise_images,
     with_detections,
 )
-from sonar_graph.sonar import REPORTED, RecogniserParams
+from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
+from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 SURE = 0.9
@@ -218,3 +219,36 @@ def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
         (ns, "frame not used: no IMU and Doppler log at its stamp") for ns in ends_ns
     ]
     assert_same_detections(result.detections, recognised(lane, good).detections)
+
+
+def test_the_notes_give_the_origin_of_detections_and_count_warnings(lane, monkeypatch):
+    monkeypatch.setattr("sonar_graph.recognition.session.MOST_WARNINGS", 3)
+    params = RecogniserParams(identity=IdentityParams(rule="jeffrey"))
+    zero = [
+        replace(lane.one(FRAMES + k), intensity=np.zeros_like(lane.one(0).intensity))
+        for k in range(10)
+    ]
+    result = recognised(lane, [*first_frames(lane), *zero], params=params)
+    assert len(result.warnings) == 3
+    assert result.outcomes["frame not used: all samples are zero"] == 10
+    assert accepted(lane, result.detections) >= {(1, 1)}
+    assert "simulated basins" in result.notes.pop("detections.model")
+    assert result.notes == {
+        "detections": f"recognised in {FRAMES + 10} sonar images",
+        "detections.designs": "1: disc, 2: square, 3: triangle, 4: cross",
+        "detections.rule": "jeffrey",
+        "detections.warnings": "10 x frame not used: all samples are zero",
+    }
+
+
+@pytest.mark.parametrize(("lens", "is_right"), [("didson", True), ("as-logged", False)])
+def test_the_lens_of_the_calibration_puts_azimuths_right(lane, lens, is_right):
+    sonar = lane.sequence.calibration.sonar.model_copy(update={"lens": lens})
+    calibration = lane.sequence.calibration.model_copy(update={"sonar": sonar})
+    told = replace(lane, sequence=replace(lane.sequence, calibration=calibration))
+    frames = one_by_one(replace(lane.frames, azimuths_rad=DIDSON.linear_azimuths_rad()))
+    found = recognised(told, frames, params=EVERY).detections
+    ids, errors = truth_of(lane, found)
+    named = errors[found.most_probable()[0] == ids, 1]
+    assert len(named) > 20
+    assert (np.degrees(np.median(np.abs(named))) < 0.1) == is_right

@@ -13,14 +13,16 @@ from sonar_graph.evaluation import format_value
 from sonar_graph.report import batch_summary as summary
 from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.rendering import as_csv, csv_text
-from sonar_graph.table import Cell, Table
+from sonar_graph.table import Cell, Column, Table
 from tests.recorded_batches import (
     LOGS,
     METRICS,
     changed,
     drawn_batch,
+    failed,
     updated,
     with_failures,
+    without,
 )
 
 ATE, YAW = metrics_of(["causal.ate_se2_m", "causal.yaw_rmse_rad"])
@@ -305,3 +307,30 @@ def test_no_cell_of_a_table_is_a_formula_and_numbers_stay():
             "a=b",
         )
     ]
+
+
+def test_sections_of_a_table_stand_in_its_csv():
+    """Of two scores of one name a paper must say which is causal."""
+    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
+    columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
+    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 1: "Smoothed"})
+    assert [row["section"] for row in rows_of(table)] == ["Causal", "Smoothed"]
+
+
+def test_the_head_shows_the_first_error_that_most_logs_have():
+    assert summary.head_metric(BATCH, EVERY_METRIC) == EVERY_METRIC[0]
+    assert (
+        summary.head_metric(without(BATCH, "ate", LOGS[0]), EVERY_METRIC)
+        == EVERY_METRIC[1]
+    )
+    assert (
+        summary.head_metric(
+            replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC
+        )
+        is None
+    )
+    assert summary.head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
+    assert (
+        summary.head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name
+        == ATE.name
+    )

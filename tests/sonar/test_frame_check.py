@@ -104,3 +104,15 @@ def test_good_frames_have_no_fault_on_the_scale_of_the_calibration():
     assert "sonar.image.full_scale" in (
         FrameCheck(SonarImage(full_scale=4095)).judge(_frame(1, wide)).fault or ""
     )
+
+
+def test_windows_that_alternate_lose_one_frame():
+    check = FrameCheck()
+    faults = [
+        check.judge(_frame(stamp, end_m=2.0 + stamp % 2)).fault for stamp in range(1, 9)
+    ]
+    assert [number for number, fault in enumerate(faults) if fault] == [1]
+    check = FrameCheck()
+    for stamp in range(1, 20):
+        shifted = _frame(stamp, end_m=2.0 + 0.2 / (BINS - 1) * (-1) ** stamp)
+        assert check.judge(shifted) == GOOD
