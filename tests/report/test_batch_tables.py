@@ -311,10 +311,12 @@ def test_no_cell_of_a_table_is_a_formula_and_numbers_stay():
 
 def test_sections_of_a_table_stand_in_its_csv():
     """Of two scores of one name a paper must say which is causal."""
-    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
+    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))] for _ in range(3)]
     columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
-    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 1: "Smoothed"})
-    assert [row["section"] for row in rows_of(table)] == ["Causal", "Smoothed"]
+    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 2: "Smoothed"})
+    assert [row["section"] for row in rows_of(table)] == [
+        *("Causal", "Causal", "Smoothed"),
+    ]
 
 
 def test_the_head_shows_the_first_error_that_most_logs_have():

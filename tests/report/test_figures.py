@@ -13,8 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import Comparison, map_instants
-from sonar_graph.evaluation.results import MapSoFar
+from sonar_graph.evaluation import Comparison
 from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
     arrange,
@@ -24,10 +23,8 @@ from sonar_graph.report.figure_style import (
     logarithmic,
     sized,
 )
-from sonar_graph.report.figures import growth_figure, illustrations, map_figure
+from sonar_graph.report.figures import illustrations, map_figure
 from sonar_graph.report.figures.error_figures import errors_cut_off
-from sonar_graph.report.figures.maps import enlargement
-from sonar_graph.states import LandmarkMap
 from tests.synthetic import basin_comparison, only
 
 TIME = "time since start (s)"
@@ -183,41 +180,3 @@ def test_a_logarithmic_axis_has_several_ticks(limits):
     ticks = panel.yaxis.get_majorticklocs()
     assert 3 <= np.count_nonzero((ticks >= limits[0]) & (ticks <= limits[1])) <= 12
     assert figure.axes == [panel]
-
-
-def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
-    """Runs that knew one landmark more at each of three times."""
-    comparison = basin_comparison(instants)
-    stamps = map_instants(comparison.instants_ns, comparison.sequence.start_ns).tolist()
-    runs = []
-    for run in comparison.runs:
-        maps = []
-        if run.landmarks is not None:
-            covariances = np.tile(sigma_m**2 * np.eye(3), (4, 1, 1))
-            known = replace(run.landmarks, covariances=covariances)
-            rows = [slice(0, 2), slice(0, 3), slice(0, 4)]
-            maps = [
-                MapSoFar(
-                    stamp,
-                    LandmarkMap(known.ids[r], known.positions[r], known.covariances[r]),
-                )
-                for stamp, r in zip(stamps, rows, strict=True)
-            ]
-        runs.append(replace(run, maps=maps))
-    return replace(comparison, runs=runs)
-
-
-def test_ellipses_are_as_large_as_the_caption_says():
-    comparison = grown(sigma_m=0.02)
-    figure = growth_figure(comparison)
-    factor = enlargement(comparison)
-    assert factor > 1
-    ellipse = next(
-        patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)
-    )
-    assert ellipse.width == pytest.approx(
-        2 * factor * 0.02 * np.sqrt(chi2.ppf(0.95, 2))
-    )
-    assert (
-        f"drawn {factor} times as large" in illustrations(comparison)["growth"].caption
-    )
