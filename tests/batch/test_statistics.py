@@ -280,10 +280,11 @@ def test_the_interval_moves_with_the_differences_and_is_a_point_where_they_are_e
 def test_a_mean_difference_is_that_of_the_means_of_cases():
     own = np.arange(12.0)
     reference = np.array([1.0, 0.0] * 6)
-    halves = statistics.paired(own, reference, [i // 2 for i in range(12)])
-    assert halves == replace(
-        statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)),
-        each="seed",
+    cases = np.array([0, 1, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5])
+    means = [(own - reference)[cases == case].mean() for case in range(6)]
+    found = statistics.paired(own, reference, cases.tolist())
+    assert found == replace(
+        statistics.paired(np.array(means), np.zeros(6)), each="seed"
     )
 
 
