@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
+from sonar_graph.devices import velocity_of_beams
 from sonar_graph.live import Engine, Message, definition_of
 from sonar_graph.live.engine import OVERLOADED
 from sonar_graph.live.live_messages import dropped_messages
@@ -329,6 +330,19 @@ def test_a_rate_that_is_no_short_number_is_recorded_to_the_bit(tmp_path, message
     assert_equal(engine, steps, tmp_path / "record.mcap")
 
 
+def test_a_velocity_of_beams_does_not_depend_on_other_pings():
+    noise = np.random.default_rng(0)
+    directions = noise.normal(size=(4, 3))
+    along = noise.normal(size=(50, 4))
+    valid = noise.random((50, 4)) < 0.9
+    velocity, _ = velocity_of_beams(directions, along, valid, 0.01)
+    alone = [
+        velocity_of_beams(directions, along[i : i + 1], valid[i : i + 1], 0.01)[0]
+        for i in range(50)
+    ]
+    assert velocity.tobytes() == np.concatenate(alone).tobytes()
+
+
 def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):
     """Unreadable first messages neither end the run nor cost the sensor."""
     engine, steps = live(
@@ -429,3 +443,24 @@ def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_
     assert engine.generation == 1
     assert any(step.detections is not None for step in steps)
     assert_equal(engine, steps, tmp_path / "record.mcap")
+
+
+def test_detections_that_were_dropped_for_being_behind_are_counted_once(
+    tmp_path, messages
+):
+    """Also after a restart with a sensor that came late."""
+    late = [
+        m
+        for m in messages
+        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
+    ]
+    with LiveRecord(tmp_path / "first.mcap") as record:
+        engine = Engine(record, definition_of)
+        for message in late:
+            engine.take(message)
+            for step in engine.steps():
+                if engine.generation == 1:
+                    engine.without_detections(step, message.arrival_ns)
+    dropped = dropped_messages(tmp_path / "first.mcap")
+    assert engine.counts.dropped == {(DETECTIONS, OVERLOADED): len(dropped)}
+    assert dropped
