@@ -134,7 +134,6 @@ def log_with_duration(
     return log
 
 
-def test_other_versions_than_planned_give_no_result(planned, tmp_path):
 def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch):
     log = log_with_duration(tmp_path, monkeypatch, 120)
     run = replace(of_log(planned(), log), landmarks={}, seed=1)
@@ -176,25 +175,3 @@ def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         perform(run, tmp_path / "file")
-
-
-def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch):
-    log = log_with_duration(tmp_path, monkeypatch, 120)
-    run = replace(of_log(planned(), log), landmarks={}, seed=1)
-    used: list[Sequence] = []
-
-    def noted(sequence: Sequence, *given: Any, **named: Any) -> Any:
-        used.append(sequence)
-        return run_here(sequence, *given, **named)
-
-    monkeypatch.setattr(one_run, "run_here", noted)
-    assert perform(run, tmp_path / "run")["status"] == "ok"
-    recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
-    expected, other = (
-        add_landmarks(recorded, LandmarkOptions(seed=seed)) for seed in (1, 0)
-    )
-    assert map_of(used[0]) == map_of(expected) != map_of(other)
-
-
-def map_of(sequence: Sequence) -> list[list[float]]:
-    return sequence.true_landmarks.positions.tolist()

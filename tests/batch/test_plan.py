@@ -129,7 +129,6 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     assert fingerprint(LOG, {"log": str(paths[0])}) == changed
 
 
-def test_an_estimator_of_another_package_has_its_package_s_hash(
 def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
     """Names and contents of the first three are the same characters one after the other."""
     for name, files in (
@@ -288,24 +287,3 @@ def test_an_absent_log_is_left_out_if_the_suite_states_its_source(
         match="no data of any log is here; get the data set from its authors",
     ):
         planned(write_suite, HEADER, ABSENT, obtain, DEAD_RECKONING)
-
-
-def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
-    """Names and contents of the first three are the same characters one after the other."""
-    for name, files in (
-        ("one", {"a": "b", "c": ""}),
-        ("two", {"a": "", "bc": ""}),
-        ("three", {"abc": ""}),
-    ):
-        (tmp_path / name).mkdir()
-        for file, content in files.items():
-            (tmp_path / name / file).write_text(content)
-
-    def content_of(name: str) -> str:
-        return fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"]
-
-    found = [content_of(name) for name in ("one", "two", "three")]
-    (tmp_path / "three" / "run").symlink_to(tmp_path / "one", target_is_directory=True)
-    found.append(content_of("three"))
-    (tmp_path / "one" / "a").write_text("d")
-    assert len({*found, content_of("three")}) == 5

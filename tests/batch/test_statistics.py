@@ -310,27 +310,3 @@ def test_the_interval_moves_with_the_differences_and_is_a_point_where_they_are_e
     for pairs in (6, 7, 10, 49):  # the mean of equal values may be rounded
         low, high = statistics.mean_interval(np.full(pairs, 0.1))
         assert low == high == pytest.approx(0.1)
-
-
-def test_a_mean_difference_is_that_of_the_means_of_cases():
-    own = np.arange(12.0)
-    reference = np.array([1.0, 0.0] * 6)
-    cases = np.array([0, 1, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5])
-    means = [(own - reference)[cases == case].mean() for case in range(6)]
-    found = statistics.paired(own, reference, cases.tolist())
-    assert found == replace(
-        statistics.paired(np.array(means), np.zeros(6)), each="seed"
-    )
-
-
-def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
-    assert statistics.signed_rank_p(np.zeros(8)) == 1.0
-    assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
-    for pairs in (6, 8):
-        assert statistics.signed_rank_p(np.arange(1.0, 1.0 + pairs)) == 2.0 ** (
-            1 - pairs
-        )
-    assert (
-        statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
-        == 1.0
-    )

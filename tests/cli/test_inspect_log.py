@@ -31,7 +31,6 @@ def sensor(said: dict, quantity: str) -> dict:
     return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
 
 
-def test_json_has_lever_arm_bias_and_start(log):
 def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
     yaw = sensor(

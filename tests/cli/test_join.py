@@ -197,7 +197,6 @@ def test_files_without_common_time_are_refused_with_an_offset(
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
-def test_navigation_with_images_is_refused_at_once(lane_log, run, tmp_path, capsys):
 def test_an_offset_that_few_images_cannot_show_must_be_stated(
     both, run, tmp_path, capsys
 ):
@@ -246,36 +245,3 @@ def test_navigation_that_has_images_already_is_refused_before_the_images_are_rea
         f"{lane_log}: has /sonar/image already; recognise it as it is"
         in capsys.readouterr().err
     )
-
-
-def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
-    both, bare, run, tmp_path
-):
-    given = tmp_path / "vehicle.toml"
-    out = tmp_path / "joined.mcap"
-    given.write_text(
-        "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
-        "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
-    )
-    for navigation in (bare, both[1]):
-        assert (
-            run(
-                "join",
-                both[0],
-                navigation,
-                "-o",
-                out,
-                "--offset",
-                OFFSET_S,
-                "--calibration",
-                given,
-            )
-            == 0
-        )
-        found = read_log(out).calibration
-        assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
-        assert found.start.position_m == (1.0, 2.0, -0.5)
-        assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
-        assert found.dvl.mounting.rpy_rad == pytest.approx(
-            read_log(navigation).calibration.dvl.mounting.rpy_rad
-        )

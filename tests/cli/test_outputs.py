@@ -98,7 +98,6 @@ def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
             assert log.read_bytes() == before
 
 
-def test_a_comparison_beside_its_log_can_be_repeated(basin, run, tmp_path):
 def test_results_never_overwrite_settings_or_a_log_of_another_program(
     basin, run, tmp_path
 ):
@@ -139,7 +138,6 @@ def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_r
             pass
 
 
-def test_commands_can_be_repeated_over_their_results(run, tmp_path, capsys):
 @pytest.mark.parametrize("content", ["another program's", "a text", "cut off"])
 def test_what_another_program_wrote_is_replaced_only_when_asked_for(
     content, run, tmp_path, capsys

@@ -443,24 +443,3 @@ def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_
     assert engine.generation == 1
     assert any(step.detections is not None for step in steps)
     assert_equal(engine, steps, tmp_path / "record.mcap")
-
-
-def test_detections_that_were_dropped_for_being_behind_are_counted_once(
-    tmp_path, messages
-):
-    """Also after a restart with a sensor that came late."""
-    late = [
-        m
-        for m in messages
-        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
-    ]
-    with LiveRecord(tmp_path / "first.mcap") as record:
-        engine = Engine(record, definition_of)
-        for message in late:
-            engine.take(message)
-            for step in engine.steps():
-                if engine.generation == 1:
-                    engine.without_detections(step, message.arrival_ns)
-    dropped = dropped_messages(tmp_path / "first.mcap")
-    assert engine.counts.dropped == {(DETECTIONS, OVERLOADED): len(dropped)}
-    assert dropped

@@ -294,21 +294,3 @@ def test_reports_of_a_track_are_as_many_as_the_mean_of_its_frames_is_worth(
     assert found_s == pytest.approx(
         29.5 * common * tracks / (tracks + 16), rel=0.1, abs=0.3
     )
-
-
-def test_logs_count_together(lane_log, measured):
-    run = read_log(lane_log)
-    twice = confusion_fit.calibrate(
-        [(lane_log, run), (lane_log, replace(run, notes={}))]
-    )
-    said = twice.provenance
-    once = measured.provenance
-    assert (said["logs"], said["what they are"]) == (
-        "lane.mcap, lane.mcap",
-        "a lane; recorded",
-    )
-    for name in ("frames of landmark 1", "tracks of landmark 1"):
-        assert int(said[name]) == 2 * int(once[name])
-    assert (
-        np.diag(twice.matrix) > np.diag(measured.matrix)
-    ).all()  # more tracks allow more certainty

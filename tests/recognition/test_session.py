@@ -20,7 +20,6 @@ from sonar_graph.recognition import (
     with_detections,
 )
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
-from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams
 from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams, confusion_for
 from tests.recognition.imaged_lane import TOPIC, Lane
 
@@ -267,26 +266,6 @@ def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
         (ns, "frame not used: no IMU and Doppler log at its stamp") for ns in ends_ns
     ]
     assert_same_detections(result.detections, recognised(lane, good).detections)
-
-
-def test_the_notes_give_the_origin_of_detections_and_count_warnings(lane, monkeypatch):
-    monkeypatch.setattr("sonar_graph.recognition.session.MOST_WARNINGS", 3)
-    params = RecogniserParams(identity=IdentityParams(rule="jeffrey"))
-    zero = [
-        replace(lane.one(FRAMES + k), intensity=np.zeros_like(lane.one(0).intensity))
-        for k in range(10)
-    ]
-    result = recognised(lane, [*first_frames(lane), *zero], params=params)
-    assert len(result.warnings) == 3
-    assert result.outcomes["frame not used: all samples are zero"] == 10
-    assert accepted(lane, result.detections) >= {(1, 1)}
-    assert "simulated basins" in result.notes.pop("detections.model")
-    assert result.notes == {
-        "detections": f"recognised in {FRAMES + 10} sonar images",
-        "detections.designs": "1: disc, 2: square, 3: triangle, 4: cross",
-        "detections.rule": "jeffrey",
-        "detections.warnings": "10 x frame not used: all samples are zero",
-    }
 
 
 @pytest.mark.parametrize(("lens", "is_right"), [("didson", True), ("as-logged", False)])

@@ -207,17 +207,6 @@ def test_even_choice_keeps_the_ends(n, points):
         assert rows[-1] == n - 1
 
 
-@pytest.mark.parametrize(
-    "limits", [(0.9, 1.1), (1.0, 9.0), (2.0, 3.0), (0.3, 40.0), (1e-3, 1e6)]
-)
-def test_a_logarithmic_axis_has_several_ticks(limits):
-    figure, axes = blank_panels(1, 1, (4.0, 3.0))
-    panel = axes[0, 0]
-    logarithmic(panel, "y")
-    panel.set_ylim(*limits)
-    ticks = panel.yaxis.get_majorticklocs()
-    assert 3 <= np.count_nonzero((ticks >= limits[0]) & (ticks <= limits[1])) <= 12
-    assert figure.axes == [panel]
 def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
     """Runs that knew one landmark more at each of three times."""
     comparison = basin_comparison(instants)

@@ -472,20 +472,6 @@ def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
     assert share == pytest.approx(expected, rel=0.2)
 
 
-@pytest.mark.parametrize("span", [80.0, 100.0])
-def test_counts_are_decibels_over_the_span(span: float):
-    made = FrameSimulator(
-        PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span})
-    )
-    counts = made.frame(ABOVE, TILT, 0)
-    inside = (counts > 0) & (counts < 255)
-    assert inside.mean() > 0.9
-    found = decibels(counts, SonarImage(decibel_span=span))
-    np.testing.assert_allclose(
-        found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4
-    )
-
-
 def test_noise_adds_its_power_to_the_echo():
     """At 2 m, where the gain over range is 0 dB."""
     first, last = bins_at(simulator(), 1.95, 2.05)

@@ -209,25 +209,6 @@ def test_beliefs_follow_their_tracks(is_reversed: bool):
     np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("association", "forgetting", "expected"),
-    [
-        ([[0.0, 0.0, 1.0]], 1e-3, [0.1, 0.2, 0.7]),  # new
-        (
-            [[1.0, 0.0, 0.0]],
-            0.1,
-            [0.91, 0.02, 0.07],
-        ),  # a share returns to the belief of a new track
-        ([[0.5, 0.5, 0.0]], 0.0, [0.5, 0.5, 0.0]),  # of either track before
-    ],
-)
-def test_prediction_follows_the_association(association, forgetting, expected):
-    predicted = predict(
-        np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting
-    )
-    np.testing.assert_allclose(predicted, [expected])
-
-
 def test_motion_ahead_is_as_much_news_as_half_of_it_to_the_side():
     ahead = _after([(0, 0, 0), (0.1, 0, 0)], ahead_ratio=2.0)
     assert ahead == pytest.approx(_after([(0, 0, 0), (0, 0.05, 0)]))
