@@ -66,6 +66,9 @@ every_estimator = for_estimators(*NAMES)
 slam_filters = for_estimators(EkfSlam, InvariantEkf)
 
 
+filters_with_bias = for_estimators(InvariantEkf, DeadReckoning)
+
+
 def later(*seconds):
     """Stamps so many seconds after the beginning; one stamp for one number."""
     stamps_ns = T0_NS + np.round(np.array(seconds) * NS_PER_S).astype(np.int64)

@@ -136,6 +136,15 @@ def means_and_covariance(slam):
     return np.concatenate([state.R.ravel(), state.points.ravel(), state.bias]), state.P
 
 
+@slam_filters
+@pytest.mark.parametrize("late_s", [6.03, 9.93])
+def test_a_late_fix_at_the_estimate_narrows_it_and_moves_nothing(kind, late_s):
+    """Before the newest epoch, at 9.8 s, and after it; with a gyro bias in the state, where there is one."""
+    slam, _ = on_a_winding_way(kind, 1.0, late_s, 9.95)
+    assert slam.node_ns == later(9.8)
+    assert_moved_by_a_late_fix(slam, late_s, 9.95, is_used=True)
+
+
 def assert_moved_by_a_late_fix(slam, late_s, now_s, *, is_used):
     """A fix at the filter's own estimate leaves the means, and makes the covariance less where it is used."""
     said = slam.trajectory()

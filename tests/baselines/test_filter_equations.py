@@ -4,9 +4,10 @@ import gtsam
 import numpy as np
 import pytest
 from hypothesis import assume, given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines import ekf_slam
+from baselines import ekf_slam, invariant_ekf
 from baselines.kalman import USED
 from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
 from sonar_graph.models import locate, range_azimuth
@@ -33,6 +34,7 @@ from .filters import (
     random_covariance,
     rotation,
     sonar_after,
+    triples,
     twists,
     views,
     world_at,
@@ -299,6 +301,21 @@ def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
 
 
 # ---------------------------------------------------------------------------------------------- invariant filter
+
+
+@given(attitudes, st.one_of(triples(*[st.floats(-1.7, 1.7)] * 3), attitudes))
+def test_an_error_moves_the_estimate_by_the_group_s_exponential(angles, turn):
+    """A measurement of the whole error without noise."""
+    world = world_at(angles)
+    xi = np.concatenate([turn, np.linspace(-0.2, 0.4, 20)])
+    expected = Invariant.moved(world, xi)
+    state = Invariant.state(world, np.eye(23))
+    invariant_ekf.update(state, np.eye(23), xi, 1e-15 * np.eye(23))
+    assert_allclose(state.R, expected.R, atol=1e-12)
+    assert_allclose(
+        state.points, np.vstack([expected.X, expected.landmarks]), atol=1e-11
+    )
+    assert_allclose(state.bias, expected.bias, atol=1e-14)
 
 
 @given(attitudes)

@@ -4,6 +4,7 @@ import importlib.util
 import sys
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -22,18 +23,35 @@ from .runs import (
     CIRCLE_S,
     CIRCLE_START,
     NO_FORCE,
+    SPEED,
     STANDARD_FORCE,
+    T0_NS,
+    YAW_RATE,
     begun,
     circle,
     circle_calibration,
     dvl,
     estimate_after,
     every_filter,
+    filters_with_bias,
     for_estimators,
     imu,
     later,
     seen,
 )
+
+
+@every_filter
+def test_a_circle_is_a_circle(kind):
+    estimator = begun(kind, circle_calibration())
+    gyro, doppler = circle()
+    for end_ns in later(*np.arange(0.5, CIRCLE_S, 0.5)):
+        rows = gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)
+        estimate = estimator.process(Measurements(int(end_ns), *rows))
+        turn = YAW_RATE * (end_ns - T0_NS) * 1e-9
+        chord = SPEED / YAW_RATE * np.array([np.sin(turn), 1 - np.cos(turn), 0.0])
+        expected = CIRCLE_START.pose().compose(gtsam.Pose3(gtsam.Rot3.Yaw(turn), chord))
+        assert estimate.world_T_body.equals(expected, 1e-9)
 
 
 @every_filter
@@ -71,6 +89,28 @@ def test_the_start_s_covariance_is_that_of_its_perturbations(kind):
     )
     covariance = estimate_after(kind, calibration, 1, imu(1), dvl(1)).covariance
     assert_allclose(covariance, start.covariance(), atol=1e-12)
+
+
+@filters_with_bias
+def test_a_bias_that_nothing_tells_widens_yaw_as_a_constant_and_a_walk_do(kind):
+    def yaw_sigma(**noise):
+        return np.sqrt(
+            estimate_after(
+                kind, circle_calibration(**noise), CIRCLE_S, *circle()
+            ).covariance[2, 2]
+        )
+
+    none = yaw_sigma(gyro_bias_sigma=0.0, gyro_bias_walk_density=1.0)
+    some = yaw_sigma(gyro_bias_sigma=1e-3, gyro_bias_walk_density=0.0)
+    walking = yaw_sigma(gyro_bias_sigma=1e-3, gyro_bias_walk_density=1e-3)
+    start_sigma = CIRCLE_START.rpy_sigma_rad[2]
+    assert none == pytest.approx(
+        np.hypot(1e-3 * np.sqrt(CIRCLE_S), start_sigma), rel=1e-3
+    )
+    assert some == pytest.approx(np.hypot(none, 1e-3 * CIRCLE_S), rel=1e-3)
+    assert walking == pytest.approx(
+        np.hypot(some, 1e-3 * np.sqrt(CIRCLE_S**3 / 3)), rel=0.02
+    )
 
 
 def test_dead_reckoning_ignores_detections_and_says_so():

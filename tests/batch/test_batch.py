@@ -1,6 +1,7 @@
 """A batch resumes, loses no run, and ends in time on Ctrl-C."""
 
 import contextlib
+import errno
 import os
 import signal
 import tempfile
@@ -18,12 +19,15 @@ from sonar_graph.batch import (
     Limits,
     Where,
     cluster,
+    is_batch,
+    read_batch,
     read_suite,
 )
+from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.result_table import is_timing
 from sonar_graph.batch.store import PlannedRun, Progress, RunOutcome, Store
-from sonar_graph.errors import BatchError
+from sonar_graph.errors import BatchError, EvaluationError
 from sonar_graph.files import (
     deferred_interrupt,
     noticed_interrupts,
@@ -111,6 +115,73 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
     monkeypatch.setattr(cluster, "run_batch", do_here)
     assert finished(suite, tmp_path / "b") == undisturbed
     assert len(set(done)) == 3
+
+
+def test_full_disk_is_told_and_loses_no_run_that_is_done(
+    suite, tmp_path, in_this_process, monkeypatch
+):
+    class Full(Store):
+        def write(self, key: str, outcome: RunOutcome) -> None:
+            if len(list((self.folder / "runs").iterdir())) == 2:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            super().write(key, outcome)
+
+    class Done:
+        def __init__(self, run: PlannedRun) -> None:
+            self.run = run
+
+        def result(self) -> RunOutcome:
+            return RunOutcome(perform(self.run, tmp_path / "scratch" / self.run.key))
+
+    def kept(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
+        for run in runs:
+            cluster.keep(run, Done(run), store, nobody)  # type: ignore[arg-type]
+
+    def no_space(*_arguments: Any) -> Path:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(cluster, "run_batch", kept)
+    folder = tmp_path / "out"
+    with (
+        Batch.opened(read_suite(suite), folder) as batch,
+        monkeypatch.context() as patch,
+    ):
+        patch.setattr(batch_module, "write_results", no_space)
+        with pytest.raises(
+            BatchError,
+            match=r"No space left.*2 of 4 runs are done and kept; the same command",
+        ):
+            Batch(batch.file, batch.runs, Full(folder)).run(HERE, LIMITS, nobody)
+    stamps = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/row.json")}
+    monkeypatch.setattr(cluster, "run_batch", do_here)
+    finished(suite, folder)
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+
+
+def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
+    suite, tmp_path, in_this_process, monkeypatch
+):
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        kill(suite, folder, 0, patch)
+        assert is_batch(folder)
+        with pytest.raises(
+            EvaluationError,
+            match=r"before any of its runs was done; give the bench command .* again",
+        ):
+            read_batch(folder)
+        kill(suite, folder, 3, patch)
+    batch = read_batch(folder)
+    assert [(run.seed, run.status) for run in batch.runs] == [
+        (0, "ok"),
+        (1, "ok"),
+        (2, "ok"),
+    ]
+    assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
+    finished(suite, folder)
+    whole = read_batch(folder)
+    assert not whole.missing
+    assert whole.runs[:3] == batch.runs
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -134,25 +134,6 @@ def log_with_duration(
     return log
 
 
-def test_other_versions_than_planned_give_no_result(planned, tmp_path):
-    run = planned()
-    for changed, told in (
-        (
-            {"gtsam": "4.2"},
-            r"a worker has gtsam 4\.3\S*, planned with gtsam 4\.2; install the same",
-        ),
-        (
-            {"source": "changed"},
-            r"a worker has source \w+, planned with source changed; ",
-        ),
-    ):
-        with pytest.raises(BatchError, match=told):
-            perform(replace(run, versions=run.versions | changed), tmp_path / "run")
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="file"):
-        perform(run, tmp_path / "file")
-
-
 def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch):
     log = log_with_duration(tmp_path, monkeypatch, 120)
     run = replace(of_log(planned(), log), landmarks={}, seed=1)
@@ -173,3 +154,24 @@ def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch
 
 def map_of(sequence: Sequence) -> list[list[float]]:
     return sequence.true_landmarks.positions.tolist()
+
+
+def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(
+    planned, tmp_path
+):
+    run = planned()
+    for changed, told in (
+        (
+            {"gtsam": "4.2"},
+            r"a worker has gtsam 4\.3\S*, planned with gtsam 4\.2; install the same",
+        ),
+        (
+            {"source": "changed"},
+            r"a worker has source \w+, planned with source changed; ",
+        ),
+    ):
+        with pytest.raises(BatchError, match=told):
+            perform(replace(run, versions=run.versions | changed), tmp_path / "run")
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        perform(run, tmp_path / "file")

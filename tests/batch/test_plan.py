@@ -1,5 +1,6 @@
 """The key of a run changes with all that decides its numbers, and with nothing else."""
 
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -128,7 +129,28 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     assert fingerprint(LOG, {"log": str(paths[0])}) == changed
 
 
-def test_an_estimator_of_another_package_has_its_package_s_hash(
+def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
+    """Names and contents of the first three are the same characters one after the other."""
+    for name, files in (
+        ("one", {"a": "b", "c": ""}),
+        ("two", {"a": "", "bc": ""}),
+        ("three", {"abc": ""}),
+    ):
+        (tmp_path / name).mkdir()
+        for file, content in files.items():
+            (tmp_path / name / file).write_text(content)
+
+    def content_of(name: str) -> str:
+        return fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"]
+
+    found = [content_of(name) for name in ("one", "two", "three")]
+    (tmp_path / "three" / "run").symlink_to(tmp_path / "one", target_is_directory=True)
+    found.append(content_of("three"))
+    (tmp_path / "one" / "a").write_text("d")
+    assert len({*found, content_of("three")}) == 5
+
+
+def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_be_loaded_is_planned(
     write_suite, misbehaving
 ):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
@@ -233,6 +255,22 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
     assert hashed() == before
 
 
+def test_hash_is_taken_once_in_a_process_and_another_sees_a_change_of_equal_size(
+    package, hashed
+):
+    before = hashed()
+    code = package / "__init__.py"
+    state = code.stat()
+    code.write_text("raise RuntimeError('Imported')\n")
+    os.utime(code, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert (code.stat().st_size, code.stat().st_mtime_ns) == (
+        state.st_size,
+        state.st_mtime_ns,
+    )
+    assert source_hash("hashed_package") == before
+    assert hashed() != before
+
+
 ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'
 
 
@@ -249,24 +287,3 @@ def test_an_absent_log_is_left_out_if_the_suite_states_its_source(
         match="no data of any log is here; get the data set from its authors",
     ):
         planned(write_suite, HEADER, ABSENT, obtain, DEAD_RECKONING)
-
-
-def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
-    """Names and contents of the first three are the same characters one after the other."""
-    for name, files in (
-        ("one", {"a": "b", "c": ""}),
-        ("two", {"a": "", "bc": ""}),
-        ("three", {"abc": ""}),
-    ):
-        (tmp_path / name).mkdir()
-        for file, content in files.items():
-            (tmp_path / name / file).write_text(content)
-
-    def content_of(name: str) -> str:
-        return fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"]
-
-    found = [content_of(name) for name in ("one", "two", "three")]
-    (tmp_path / "three" / "run").symlink_to(tmp_path / "one", target_is_directory=True)
-    found.append(content_of("three"))
-    (tmp_path / "one" / "a").write_text("d")
-    assert len({*found, content_of("three")}) == 5

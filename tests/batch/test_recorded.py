@@ -20,6 +20,7 @@ from sonar_graph.batch import (
 from sonar_graph.batch.result_table import (
     COLUMNS,
     SUITE_METADATA,
+    is_timing,
     write_results,
 )
 from sonar_graph.batch.store import RunOutcome, Store
@@ -133,3 +134,28 @@ def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(
     assert (store.folder / table["log_file"][0].as_py()).is_file()
     about = json.loads(table.schema.metadata[SUITE_METADATA])
     assert about["reference"] == "dead-reckoning"
+
+
+def test_table_of_a_batch_without_any_run_has_the_columns(write_suite, tmp_path):
+    file = read_suite(write_suite())
+    (tmp_path / "\udcff").mkdir()  # no name in UTF-8
+    path = write_results(Store(tmp_path / "\udcff"), file.suite, plan_runs(file))
+    table = pq.read_table(path.rename(tmp_path / path.name))
+    assert table.column_names == [*COLUMNS]
+    assert table["status"].to_pylist() == ["not run"]
+
+
+def test_times_and_memory_alone_may_differ_between_equal_runs():
+    timings = {
+        "wall_s",
+        "cpu_s",
+        "time.total_s",
+        "memory.peak_mb",
+    }
+    assert all(map(is_timing, timings))
+    assert not any(
+        map(
+            is_timing,
+            ("key", "causal.ate_raw_m", "scored_instants", "machine", "status"),
+        )
+    )

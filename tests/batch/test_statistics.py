@@ -56,6 +56,18 @@ def test_the_interval_solves_halls_equation(listed):
         )
 
 
+def test_the_interval_moves_with_the_differences_is_a_point_where_they_are_equal_and_unknown_for_few():
+    assert np.isnan(statistics.mean_interval(np.arange(5.0))).all()
+    assert np.isfinite(statistics.mean_interval(np.arange(6.0))).all()
+    values = np.random.default_rng(14).exponential(0.1, 12)
+    near = pytest.approx(statistics.mean_interval(values), abs=1e-6)
+    for far in (1e3, -1e6):
+        assert np.array(statistics.mean_interval(values + far)) - far == near
+    for pairs in (6, 7, 10, 49):  # the mean of equal values may be rounded
+        low, high = statistics.mean_interval(np.full(pairs, 0.1))
+        assert low == high == pytest.approx(0.1)
+
+
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), shares)
 def test_quantile_of_finite_values_is_numpys(values, share):
     expected = float(np.quantile(values, share))
@@ -158,6 +170,16 @@ def test_pairs_of_one_case_make_one_difference(
     assert (told.median, told.mean) == pytest.approx((median, mean), nan_ok=True)
 
 
+def test_a_mean_difference_is_that_of_the_means_of_cases():
+    own = np.arange(12.0)
+    reference = np.array([1.0, 0.0] * 6)
+    halves = statistics.paired(own, reference, [i // 2 for i in range(12)])
+    assert halves == replace(
+        statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)),
+        each="seed",
+    )
+
+
 @pytest.mark.parametrize(
     ("scale", "verdict", "least", "most"),
     [
@@ -253,6 +275,19 @@ def test_the_exact_signed_rank_test_is_that_of_all_sign_patterns(
         )
 
 
+def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
+    assert statistics.signed_rank_p(np.zeros(8)) == 1.0
+    assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
+    for pairs in (6, 8):
+        assert statistics.signed_rank_p(np.arange(1.0, 1.0 + pairs)) == 2.0 ** (
+            1 - pairs
+        )
+    assert (
+        statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
+        == 1.0
+    )
+
+
 @given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_failure_rate_solves_wilsons_equation(counts):
     failed, runs = counts
@@ -275,27 +310,3 @@ def test_the_interval_moves_with_the_differences_and_is_a_point_where_they_are_e
     for pairs in (6, 7, 10, 49):  # the mean of equal values may be rounded
         low, high = statistics.mean_interval(np.full(pairs, 0.1))
         assert low == high == pytest.approx(0.1)
-
-
-def test_a_mean_difference_is_that_of_the_means_of_cases():
-    own = np.arange(12.0)
-    reference = np.array([1.0, 0.0] * 6)
-    cases = np.array([0, 1, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5])
-    means = [(own - reference)[cases == case].mean() for case in range(6)]
-    found = statistics.paired(own, reference, cases.tolist())
-    assert found == replace(
-        statistics.paired(np.array(means), np.zeros(6)), each="seed"
-    )
-
-
-def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
-    assert statistics.signed_rank_p(np.zeros(8)) == 1.0
-    assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
-    for pairs in (6, 8):
-        assert statistics.signed_rank_p(np.arange(1.0, 1.0 + pairs)) == 2.0 ** (
-            1 - pairs
-        )
-    assert (
-        statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
-        == 1.0
-    )

@@ -17,6 +17,10 @@ OUTCOME = RunOutcome(
 )
 
 
+class Died(BaseException):
+    """Ends a process."""
+
+
 def names(folder: Path) -> list[str]:
     return sorted(
         path.relative_to(folder).as_posix()
@@ -68,6 +72,47 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
         store.write("next", OUTCOME)
     assert names(tmp_path) == before
     assert not list((tmp_path / "runs").glob(".*"))
+
+
+def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch):
+    store = Store(tmp_path)
+
+    def die(_self: Path, _target: Path) -> None:
+        raise Died
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", die)
+        # a killed process cleans nothing up
+        patch.setattr("sonar_graph.batch.store.remove_written", lambda _: None)
+        with pytest.raises(Died):
+            store.write("k", OUTCOME)
+    assert store.row("k") is None
+    assert list((tmp_path / "runs").iterdir())
+    store.remove_partial()
+    assert not list((tmp_path / "runs").iterdir())
+
+
+@pytest.mark.parametrize("act", ["discard", "write"])
+def test_a_process_killed_during_removal_leaves_a_run_whole_or_gone(
+    tmp_path, monkeypatch, act
+):
+    store = Store(tmp_path)
+    store.write("k", OUTCOME)
+    whole = names(store.run_folder("k"))
+
+    def die(folder: Path, **_options: Any) -> None:
+        next(path for path in folder.rglob("*.npz")).unlink()
+        raise Died
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sonar_graph.batch.store.remove_written", die)
+        with pytest.raises(Died):
+            store.discard("k") if act == "discard" else store.write("k", OUTCOME)
+    assert (store.row("k") is None) == (not store.run_folder("k").exists())
+    assert not store.run_folder("k").exists() or names(store.run_folder("k")) == whole
+    store.remove_partial()
+    store.write("k", OUTCOME)
+    assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
 
 
 def test_a_lost_or_foreign_row_counts_as_not_done(

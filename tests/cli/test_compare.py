@@ -220,6 +220,19 @@ def test_estimators_lists_every_setting(run, capsys):
             assert setting in shown
 
 
+def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys):
+    options = ("--estimator", "dead-reckoning", "--start", "30", "--end", "60")
+    # the start that the log states is another
+    assert run("run", basin, "-o", tmp_path / "out", *options) == 3
+    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"][
+        "notes"
+    ]
+    assert notes["log.part"] == "30.000 s to 60.000 s of the recording"
+    capsys.readouterr()
+    assert run("inspect", basin, "--start", "30", "--end", "60") == 3
+    assert ", 30.0 s" in capsys.readouterr().out
+
+
 def test_a_damaged_log_is_refused_with_the_option_that_reads_it(
     run, basin, tmp_path, capsys
 ):

@@ -1,6 +1,7 @@
 """``inspect`` names what a log has, compares its sensors, and gives advice that can be followed."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,16 @@ def sensor(said: dict, quantity: str) -> dict:
     return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
 
 
-def test_json_has_lever_arm_bias_and_start(log):
+def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
+    (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
+    yaw = sensor(
+        answer(log, "--calibration", tmp_path / "turned.toml"), "DVL mounting yaw"
+    )
+    assert yaw["value"] == pytest.approx(-5.73, abs=1.0)
+    assert "dvl.mounting.rpy_rad" in yaw["advice"]
+
+
+def test_json_has_lever_arm_bias_and_start_as_numbers_unless_nothing_was_compared(log):
     said = answer(log)
     assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(
         -0.2, abs=0.1
@@ -78,3 +88,23 @@ def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
     *_, lack, advice = capsys.readouterr().out.splitlines()
     assert lack == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
     assert "--toml > log.toml" in advice
+
+
+def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
+    run, basin, monkeypatch, capsys
+):
+    monkeypatch.setattr("sonar_graph.cli.inspect_log.MOST_TOPICS", 2)
+    assert run("inspect", basin, "--quick") == 0
+    shown, hidden = re.search(
+        r"(?s)(.*?)not shown (\d+) more topics", capsys.readouterr().out
+    ).groups()
+    topics = {topic["name"] for topic in answer(basin, "--quick")["topics"]}
+    assert len(topics) == 2 + int(hidden)
+    assert sum(f"\n{name} " in shown for name in topics) == 2
+
+
+def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
+    log = tmp_path / "victoria_park.mcap"
+    assert run("convert", "dataset", "victoria-park", "-o", log) == 0
+    assert "3640 landmark detections" in capsys.readouterr().out
+    assert run("inspect", log) == 0

@@ -24,6 +24,7 @@ from sonar_graph.logs import (
     write_log,
 )
 from sonar_graph.logs.mcap import recording
+from tests.logs.converters.sonar_recordings import Aris, images
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 OFFSET_S = 2.4
@@ -128,6 +129,39 @@ def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
     assert "not stated" in joined.notes["log.start"]
 
 
+def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
+    both, bare, run, tmp_path
+):
+    given = tmp_path / "vehicle.toml"
+    out = tmp_path / "joined.mcap"
+    given.write_text(
+        "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
+        "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
+    )
+    for navigation in (bare, both[1]):
+        assert (
+            run(
+                "join",
+                both[0],
+                navigation,
+                "-o",
+                out,
+                "--offset",
+                OFFSET_S,
+                "--calibration",
+                given,
+            )
+            == 0
+        )
+        found = read_log(out).calibration
+        assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
+        assert found.start.position_m == (1.0, 2.0, -0.5)
+        assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
+        assert found.dvl.mounting.rpy_rad == pytest.approx(
+            read_log(navigation).calibration.dvl.mounting.rpy_rad
+        )
+
+
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
     lane, both, run, tmp_path, capsys
 ):
@@ -163,7 +197,47 @@ def test_files_without_common_time_are_refused_with_an_offset(
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
-def test_navigation_with_images_is_refused_at_once(lane_log, run, tmp_path, capsys):
+def test_an_offset_that_few_images_cannot_show_must_be_stated(
+    both, run, tmp_path, capsys
+):
+    file = tmp_path / "dive.aris"
+    file.write_bytes(Aris(images(6, 128, 300)).content())
+    recorded = converted(run, file)
+    first_ns = next(read_sonar_frames(recorded)).stamps_ns[0]
+    offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
+    out = tmp_path / "joined.mcap"
+    assert (
+        run(
+            "join",
+            recorded,
+            both[1],
+            "-o",
+            out,
+            "--offset",
+            f"{offset_s:.6f}",
+            "--search",
+            2,
+        )
+        == 2
+    )
+    assert (
+        "steps between them could be measured, and 50 are needed; state it"
+        in capsys.readouterr().err
+    )
+    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
+    assert "as stated; the images do not determine" in capsys.readouterr().out
+    assert sum(len(block) for block in read_sonar_frames(out)) == 6
+
+
+def converted(run, recorded: Path) -> Path:
+    out = recorded.with_suffix(".mcap")
+    assert run("convert", "aris", recorded, "-o", out) == 0
+    return out
+
+
+def test_navigation_that_has_images_already_is_refused_before_the_images_are_read(
+    lane_log, run, tmp_path, capsys
+):
     nothing = tmp_path / "none.aris"
     nothing.write_bytes(b"")
     assert run("join", nothing, lane_log, "-o", tmp_path / "joined.mcap") == 2
@@ -171,36 +245,3 @@ def test_navigation_with_images_is_refused_at_once(lane_log, run, tmp_path, caps
         f"{lane_log}: has /sonar/image already; recognise it as it is"
         in capsys.readouterr().err
     )
-
-
-def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
-    both, bare, run, tmp_path
-):
-    given = tmp_path / "vehicle.toml"
-    out = tmp_path / "joined.mcap"
-    given.write_text(
-        "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
-        "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
-    )
-    for navigation in (bare, both[1]):
-        assert (
-            run(
-                "join",
-                both[0],
-                navigation,
-                "-o",
-                out,
-                "--offset",
-                OFFSET_S,
-                "--calibration",
-                given,
-            )
-            == 0
-        )
-        found = read_log(out).calibration
-        assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
-        assert found.start.position_m == (1.0, 2.0, -0.5)
-        assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
-        assert found.dvl.mounting.rpy_rad == pytest.approx(
-            read_log(navigation).calibration.dvl.mounting.rpy_rad
-        )

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 from sonar_graph.cli.compare import names_written
 from sonar_graph.cli.outputs import writable_folder
@@ -11,6 +12,16 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.files import LOCK, MANIFEST
 
 QUICK = ("--estimators", "dead-reckoning")
+
+
+def foreign_log(path: Path) -> bytes:
+    """A log that another program wrote."""
+    path.parent.mkdir(exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="a recorder")
+        writer.finish()
+    return path.read_bytes()
 
 
 def links(target: Path, folder: Path) -> list[Path]:
@@ -42,6 +53,24 @@ def test_a_log_made_from_a_file_never_replaces_it(
     assert basin.read_bytes() == before
 
 
+def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either(
+    basin, run, tmp_path, capsys
+):
+    part = tmp_path / "bag" / "bag_0.mcap"
+    model = tmp_path / "log.json"
+    contents = foreign_log(part), basin.read_bytes()
+    model.hardlink_to(basin)
+    rosbag = ("convert", "rosbag", part.parent, "-o", part, "--overwrite")
+    for command in (
+        rosbag,
+        ("calibrate", basin, "-o", model),
+        ("label", basin, "-o", model),
+    ):
+        assert run(*command) == 2
+        assert "is what is read" in capsys.readouterr().err
+    assert (part.read_bytes(), basin.read_bytes()) == contents
+
+
 @pytest.mark.parametrize(
     "name",
     [
@@ -69,7 +98,26 @@ def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
             assert log.read_bytes() == before
 
 
-def test_a_comparison_beside_its_log_can_be_repeated(basin, run, tmp_path):
+def test_results_never_overwrite_settings_or_a_log_of_another_program(
+    basin, run, tmp_path
+):
+    settings = tmp_path / "comparison.json"
+    settings.write_text("{}")
+    for option in ("--calibration", "--log-config"):
+        assert run("compare", basin, "-o", tmp_path, option, settings, *QUICK) == 2
+    assert settings.read_text() == "{}"
+    for path, command in (
+        ("a/result.mcap", ("compare", basin, *QUICK)),
+        ("b/basin.mcap", ("demo",)),
+    ):
+        before = foreign_log(tmp_path / path)
+        assert run(*command, "-o", (tmp_path / path).parent) == 2
+        assert (tmp_path / path).read_bytes() == before
+
+
+def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_read_and_written(
+    basin, run, tmp_path
+):
     before = basin.read_bytes()
     for _ in range(2):
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
@@ -90,7 +138,35 @@ def test_a_comparison_beside_its_log_can_be_repeated(basin, run, tmp_path):
             pass
 
 
-def test_commands_can_be_repeated_over_their_results(run, tmp_path, capsys):
+@pytest.mark.parametrize("content", ["another program's", "a text", "cut off"])
+def test_what_another_program_wrote_is_replaced_only_when_asked_for(
+    content, run, tmp_path, capsys
+):
+    log = tmp_path / "log.mcap"
+    before = (
+        foreign_log(log)
+        if content == "another program's"
+        else b"words"
+        if content == "a text"
+        else b"\x89MCAP0"
+    )
+    log.write_bytes(before)
+    for command in (
+        ("convert", "dataset", "victoria-park"),
+        ("simulate", "basin", "--duration-s", "120", "--laps", "1"),
+    ):
+        assert run(*command, "-o", log) == 2
+        assert re.fullmatch(
+            r"sonar-graph: .*did not write it; .*--overwrite\n", capsys.readouterr().err
+        )
+        assert log.read_bytes() == before
+    assert run("convert", "dataset", "victoria-park", "-o", log, "--overwrite") == 0
+    assert log.read_bytes() != before
+
+
+def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothing(
+    run, tmp_path, capsys
+):
     log = tmp_path / "log.mcap"
     log.touch()  # an empty file holds nothing to lose
     for told in ("", f"Replaces {log}\n"):
@@ -133,3 +209,38 @@ def test_a_refused_command_leaves_no_new_folder(run, basin, tmp_path):
         assert {basin, unreadable, there} == set(tmp_path.iterdir())
         assert not list(there.iterdir())
     assert run("compare", basin, "-o", tmp_path / "made" / "below", *QUICK) == 0
+
+
+OURS = [
+    "recognised/1.jpg",
+    "report.html",
+    "comparison.json",
+]
+THEIRS = [
+    "recognised/mine.jpg",
+    "runs/mine/series.npz",
+    ".log.mcap.partial",
+    ".partial-log.mcap",
+    "log.mcap.part",
+]
+
+
+@pytest.mark.parametrize("ours", [None, *OURS])
+def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
+    ours, basin, run, tmp_path, capsys
+):
+    folder = tmp_path / "out"
+    mine = [folder / name for name in [*THEIRS, *([ours] if ours else [])]]
+    for path in mine:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("mine")
+    for command in (
+        ("compare", basin, *QUICK),
+        ("run", basin, "--estimator", "dead-reckoning"),
+    ):
+        assert run(*command, "-o", folder) == (2 if ours else 0)
+        assert (
+            f"holds {ours}, which sonar-graph did not write" in capsys.readouterr().err
+        ) == bool(ours)
+    assert run("convert", "dataset", "victoria-park", "-o", folder / "log.mcap") == 0
+    assert {path.read_text() for path in mine} == {"mine"}

@@ -11,6 +11,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs import write_log
 from sonar_graph.logs.convert import read_csv
 from sonar_graph.measurements import Dvl
+from sonar_graph.states import Trajectory
 from sonar_graph.testing import small_world
 
 IMU = """[imu]
@@ -155,6 +156,23 @@ def test_a_wrong_use_is_one_line_that_says_what_to_do(
     assert sorted(folder.rglob("*")) == before
 
 
+def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, capsys):
+    words = (
+        "convert",
+        "csv",
+        folder,
+        "--config",
+        folder / "late.toml",
+        "-o",
+        tmp_path / "late.mcap",
+    )
+    assert run(*words) == 0
+    assert re.search(
+        r"warning: imu: 2 times backwards, by .* rows are sorted",
+        capsys.readouterr().err,
+    )
+
+
 def test_a_truth_of_tables_may_lack_its_orientation(folder, tmp_path):
     world = small_world()
     truth = ["time,x,y,z", *rows(world.truth.stamps_ns, world.truth.positions)]
@@ -166,6 +184,92 @@ def test_a_truth_of_tables_may_lack_its_orientation(folder, tmp_path):
     (tmp_path / "dive.toml").write_text(IMU + DVL + TRUTH + "orientations = false\n")
     with pytest.raises(LogError, match="orientations: there is no such field"):
         read_csv(tables, tmp_path / "dive.toml")
+
+
+def test_tables_with_another_unit_of_velocity_are_reported(
+    run, folder, tmp_path, capsys
+):
+    (tmp_path / "dive.toml").write_text(IMU + DVL + "scale = 1000\n")
+    assert (
+        run(
+            "convert",
+            "csv",
+            folder,
+            "--config",
+            tmp_path / "dive.toml",
+            "-o",
+            tmp_path / "new.mcap",
+        )
+        == 0
+    )
+    said = capsys.readouterr().err
+    assert re.search(
+        r"warning: DVL: unit: velocities look 1000 times too large .*`scale = 0\.001` .*dive\.toml",
+        said,
+    )
+    assert (
+        run(
+            "convert",
+            "csv",
+            folder,
+            "--config",
+            folder / "good.toml",
+            "-o",
+            tmp_path / "good.mcap",
+        )
+        == 0
+    )
+    assert "unit" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["run", "compare"])
+def test_velocities_a_thousand_times_too_large_come_first(
+    run, folder, tmp_path, command, capsys
+):
+    names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")
+    run(command, folder / "fast.mcap", "-o", tmp_path / "out", *names)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Doubtful: DVL: unit: velocities look 1000 times too large" in said
+    assert "`scale = 0.001` under [dvl]" in said
+
+
+def test_a_start_that_nobody_stated_is_said_and_errors_are_after_the_fit(
+    run, folder, tmp_path, capsys
+):
+    world = small_world()
+    far = Trajectory.of_positions(
+        world.truth.stamps_ns, world.truth.positions[:, [1, 0, 2]] * [-1, 1, 1] + 5e5
+    )
+    bare = world.calibration.model_copy(
+        update={"start": type(world.calibration.start)()}
+    )
+    bare.model_fields_set.discard("start")
+    write_log(
+        tmp_path / "free.mcap",
+        replace(world, truth=far, calibration=bare, true_landmarks=None),
+    )
+    out = tmp_path / "out"
+    assert (
+        run(
+            "compare",
+            tmp_path / "free.mcap",
+            "-o",
+            out,
+            "--estimators",
+            "dead-reckoning",
+        )
+        == 0
+    )
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "Truth: the log states no start, so the truth was brought into the world of the estimates"
+        in said
+    )
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert (
+        "The log states no start, so the truth was brought into the world of the estimates"
+        in page
+    )
 
 
 def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):

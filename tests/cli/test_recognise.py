@@ -63,6 +63,50 @@ def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(
     )
 
 
+def test_recognise_says_what_became_of_everything(
+    lane, lane_log, lane_recognition, run, tmp_path, capsys
+):
+    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap") == 0
+    said = capsys.readouterr().out
+    assert (
+        f"{len(lane.frames)} frames, {len(lane_recognition.detections)} detections"
+        in said
+    )
+    for outcome, count in lane_recognition.outcomes.items():
+        assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE), (
+            outcome
+        )
+    assert said.rstrip().endswith("out.mcap")
+    ids, probability = lane_recognition.detections.most_probable()
+    counts = [
+        f"landmark {k}: {np.count_nonzero((ids == k) & (probability > 0.5))}"
+        for k in (1, 2, 3, 4)
+    ]
+    rest = np.count_nonzero(probability <= 0.5)
+    assert f"Most probable: {', '.join(counts)}, none of them: {rest}\n" in said
+    assert "Warning" not in said
+
+
+def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, capsys):
+    assert (
+        run("recognise", recognised, "-o", tmp_path / "again.mcap", "--rule", "jeffrey")
+        == 0
+    )
+    assert "Replaced: " in capsys.readouterr().out
+    one = read_log(recognised).detections
+    other = read_log(tmp_path / "again.mcap").detections
+    assert set(one.track.tolist()) == set(other.track.tolist())
+    of_both = [
+        (a, b)
+        for a in range(len(one))
+        for b in range(len(other))
+        if one.stamps_ns[a] == other.stamps_ns[b]
+    ]
+    same = [(a, b) for a, b in of_both if one.track[a] == other.track[b]]
+    mine, its = np.array(same).T
+    assert not np.allclose(one.id_probability[mine], other.id_probability[its])
+
+
 def test_compare_recognises_by_itself_and_gives_what_recognise_gives(
     lane_log, recognised, run, tmp_path, capsys
 ):
@@ -272,3 +316,21 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(
             channel.topic for _, channel, _ in make_reader(stream).iter_messages()
         }
     assert topics == {TOPIC, "/sonar/landmarks"}
+
+
+def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(
+    lane_log, run, tmp_path, capsys
+):
+    page = tmp_path / "page.html"
+    out = tmp_path / "out.mcap"
+    page.write_text("mine")
+    assert run("recognise", lane_log, "-o", out, "--report", page) == 2
+    assert (
+        "page.html: exists, and sonar-graph did not write it" in capsys.readouterr().err
+    )
+    assert run("recognise", lane_log, "-o", out, "--report", tmp_path / "page.pdf") == 2
+    assert "expected the name of a file that ends in .html" in capsys.readouterr().err
+    for more in (("--overwrite",), ()):
+        assert run("recognise", lane_log, "-o", out, "--report", page, *more) == 0
+        assert f"Page: {page}" in capsys.readouterr().out
+        assert 'id="track-0"' in page.read_text()

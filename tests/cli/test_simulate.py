@@ -84,6 +84,31 @@ def test_images_and_sensors_are_those_of_the_library(
     assert times_ns == sorted(times_ns)
 
 
+def test_simulation_flags_and_settings_reach_the_simulator(
+    run, tmp_path, monkeypatch, capsys
+):
+    given_options = []
+    monkeypatch.setattr("sonar_graph.simulation.simulate_basin", given_options.append)
+    monkeypatch.setattr("sonar_graph.logs.write_log", lambda path, _: path.touch())
+    flags = (
+        "--seed",
+        7,
+        "--laps",
+        2,
+        "--set",
+        "imu=mti1",
+        "--set",
+        "gyro_bias_scale=0.0",
+        "--set",
+        "wrong_id_rate=0.05",
+    )
+    assert run("simulate", "basin", "-o", tmp_path / "basin.mcap", *flags) == 0
+    options = given_options[0]
+    assert (options.seed, options.laps, options.imu) == (7, 2, "mti1")
+    assert (options.gyro_bias_scale, options.wrong_id_rate) == (0.0, 0.05)
+    assert capsys.readouterr().out == f"Log: {tmp_path / 'basin.mcap'}\n"
+
+
 @pytest.fixture(scope="module")
 def log(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("landmarks") / "recorded.mcap"

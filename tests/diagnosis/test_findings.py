@@ -86,6 +86,20 @@ def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
     ).imu.mounting.translation_m == pytest.approx(places[0])
 
 
+def test_an_unobservable_axis_of_the_lever_arm_keeps_its_value():
+    rows = lever_findings(match((UNKNOWN, *arm(0.6, 0.3))), GIVEN)
+    assert rows[0].text() == "cannot be told: too little turning"
+    assert [row.acts for row in rows] == [False, True, False]
+    assert "`imu.mounting.translation_m = [0.500, -0.400, 0.000]`" in rows[1].advice
+    rows = [
+        *lever_findings(match((UNKNOWN,) * 3), GIVEN),
+        *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu, A_MINUTE),
+    ]
+    assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
+    assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
+    assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
+
+
 def test_a_bias_beyond_its_sigma_is_stated_along_the_axes_of_the_imu():
     sources = ("from 20 s of rest", "from turns", "from turns")
     biases = arm(1e-3, 1.5e-4, -4e-3, sigma=1e-4)

@@ -33,6 +33,11 @@ def true_poses(motion: BodyMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return poses.positions, yaw, poses.rotations().as_matrix()[:, 2]
 
 
+def without_imu(run: Sequence, begin_s: float, end_s: float) -> Sequence:
+    t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    return replace(run, imu=run.imu.rows((t <= begin_s) | (t >= end_s)))
+
+
 @pytest.mark.parametrize("bias", [0.0, 0.01])
 def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
     """A bias that the calibration knows is taken off."""
@@ -52,6 +57,17 @@ def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
     assert np.abs(ours - (level - level[0])).max() < 0.8
     assert np.sum(motion.up * up, axis=1).min() > np.cos(0.03)
     assert np.all(motion.parts == 0)
+
+
+def test_an_imu_hole_splits_motion_and_reference():
+    motion = motion_of(without_imu(RUN, 40.0, 46.0))
+    assert set(motion.parts) == {0, 1}
+    yaw = motion.reference(motion.yaw_rad)
+    assert np.isnan(yaw(np.array([41.0, 43.0, 45.0]))).all()
+    assert np.isfinite(yaw(np.array([39.0, 47.0]))).all()
+    assert np.isnan(yaw(motion.seconds[[0, -1]] + [-1.0, 1.0])).all()
+    rows = motion.stretches(np.arange(100.0), np.arange(100.0), yaw)
+    assert all(part.seconds[-1] <= 41 or part.seconds[0] >= 45 for part in rows)
 
 
 @pytest.mark.parametrize("angle", [-0.7, 0.5 * np.pi])

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import Finding, sensor_check
+from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_units
 from sonar_graph.logs.adapters import LogConfig
@@ -176,6 +177,22 @@ def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
         ) == acts
 
 
+def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
+    roll, pitch, yaw = start_of(SHORT, SHORT.truth)
+    found = by_name(
+        sensor_check.check_sensors(started_at(SHORT, roll + 0.1, pitch, yaw + 0.2))
+    )
+    ours, theirs = (
+        line_of(found[name])["start"]
+        for name in ("start roll: value", "start heading: error")
+    )
+    assert (
+        ours["rpy_rad"]
+        == theirs["rpy_rad"]
+        == pytest.approx([roll, pitch, yaw], abs=2e-3)
+    )
+
+
 def test_a_number_that_cannot_be_told_asks_for_nothing():
     short = replace(
         RIGHT,
@@ -189,6 +206,25 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
         if finding.quantity != "accelerometer scale":
             assert finding.text().startswith("cannot be told: ")
             assert finding.plain()["value"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hole_s", [2.0, 5.0])
+def test_a_hole_of_the_imu_asks_for_nothing(
+    hole_s: float, monkeypatch: pytest.MonkeyPatch
+):
+    """Drawn straight across, 5 s of manoeuvres make a wrong offset of the reference."""
+    t = (RIGHT.imu.stamps_ns - RIGHT.imu.stamps_ns[0]) * 1e-9
+    run = replace(RIGHT, imu=RIGHT.imu.rows((t <= 100.0) | (t >= 100.0 + hole_s)))
+    found = by_name(sensor_check.check_sensors(run))
+    assert [finding.text() for finding in found.values() if finding.acts] == []
+    assert found["DVL scale"].estimate.is_known
+    assert found["reference against IMU: time offset"].estimate.is_known
+    monkeypatch.setattr(
+        "sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like
+    )
+    blind = by_name(sensor_check.check_sensors(run))
+    assert blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
 
 
 @pytest.mark.parametrize(
@@ -211,6 +247,33 @@ def told(
 ) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
     x, y, z = (Estimate1D(value, sigma) for value in values)
     return x, y, z
+
+
+@pytest.mark.parametrize("acts", [True, False])
+def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
+    offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
+    numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
+    match = DvlMatch(
+        *numbers,
+        lever=told(-0.2, 0.0, -0.15),
+        gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6),
+    )
+    turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
+    rows = list(sensor_check.dvl_findings(match, turned, LogConfig()))
+    assert [row.acts for row in rows] == [acts] * 3
+    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), (
+        "that of a sample's instant"
+    )
+    right = sensor_check.corrected_sequence(turned, match, rows)
+    assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(
+        400_000_000 if acts else 0
+    )
+    assert right.dvl.velocity == pytest.approx(
+        RIGHT.dvl.velocity * (1.04 if acts else 1.0)
+    )
+    assert right.calibration.dvl.mounting.rpy_rad == pytest.approx(
+        (0.3, 0.1, 0.25 if acts else 0.2)
+    )
 
 
 def test_the_bias_of_smaller_sigma_wins_axis_by_axis():
@@ -314,6 +377,21 @@ def test_ranges_decide_no_unit_with_wrong_axes_outliers_or_few_landmarks():
     assert not wrong_units(replace(SLOW, detections=None, dvl=far), LogConfig())
 
 
+def test_usual_readings_raise_no_doubt_about_units():
+    """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
+    assert not units(speed=19.9, turn=1.99, force=9.0)
+    for force in (0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6):
+        assert not units(force=force), "gravity in no unit"
+    (fault,) = units(force=0.78, gravity=9.1)
+    assert "instead of 9.1 m/s²: g?" in fault.advice
+    (fault,) = units(force=np.where(np.arange(N) < 40, 20.0, 1.0))
+    assert "typically 1 instead" in fault.advice
+    (fault,) = units(turn=2.1)
+    assert fault.advice.startswith(
+        "rates look 57 times too large (up to 2.1 rad/s): degrees a second? "
+    )
+
+
 def test_slow_rates_in_degrees_are_told_by_gravity():
     """They tilt the vehicle 57 times farther than gravity turns in the accelerometers; radians, by as much.
 
@@ -358,6 +436,35 @@ def test_readings_that_never_change_have_no_noise_to_be_told():
     assert by_name(list(sensor_check.noise_findings(moved)))[
         "gyro noise density"
     ].estimate.is_known
+
+
+@pytest.mark.parametrize("sensor", ["imu", "dvl"])
+def test_a_delay_that_all_others_share_is_that_of_the_imu(sensor: str) -> None:
+    """With the Doppler log late alone, the other sensors agree with the IMU, and the line is the log's."""
+    rows = getattr(RIGHT, sensor)
+    late = replace(rows, stamps_ns=rows.stamps_ns + 500_000_000)
+    found = by_name(sensor_check.check_sensors(replace(RIGHT, **{sensor: late})))
+    offset = found["DVL against IMU: time offset"]
+    assert offset.acts
+    assert f"under [{sensor}]" in offset.advice
+    assert line_of(offset)["stamp_offset_s"] == pytest.approx(-0.5, abs=0.05)
+    assert not any(
+        finding.acts for name, finding in found.items() if name.endswith(": delay")
+    )
+
+
+@pytest.mark.parametrize(("off_rad", "is_grave"), [(0.1, False), (3.0, True)])
+def test_a_start_on_its_back_makes_results_doubtful(off_rad, is_grave):
+    roll, pitch, yaw = SHORT.calibration.start.rpy_rad
+    found = {
+        finding.quantity: finding
+        for finding in sensor_check.check_sensors(
+            started_at(SHORT, roll + off_rad, pitch, yaw)
+        )
+    }
+    row = found["start roll: value"]
+    assert row.acts
+    assert (row.gravity is Gravity.GRAVE) == is_grave
 
 
 def test_of_forces_without_gravity_nothing_else_is_blamed() -> None:
@@ -408,45 +515,3 @@ def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> N
         run = replace(run, depth=replace(run.depth, z_m=z_m))
     found = [f.quantity for f in coarse_findings(run)]
     assert found == ([] if sensor == "none" else [f"{sensor}: resolution"])
-
-
-def test_usual_readings_raise_no_doubt_about_units():
-    """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
-    assert not units(speed=19.9, turn=1.99, force=9.0)
-    for force in (0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6):
-        assert not units(force=force), "gravity in no unit"
-    (fault,) = units(force=0.78, gravity=9.1)
-    assert "instead of 9.1 m/s²: g?" in fault.advice
-    (fault,) = units(force=np.where(np.arange(N) < 40, 20.0, 1.0))
-    assert "typically 1 instead" in fault.advice
-    (fault,) = units(turn=2.1)
-    assert fault.advice.startswith(
-        "rates look 57 times too large (up to 2.1 rad/s): degrees a second? "
-    )
-
-
-@pytest.mark.parametrize("acts", [True, False])
-def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
-    offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
-    numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
-    match = DvlMatch(
-        *numbers,
-        lever=told(-0.2, 0.0, -0.15),
-        gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6),
-    )
-    turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
-    rows = list(sensor_check.dvl_findings(match, turned, LogConfig()))
-    assert [row.acts for row in rows] == [acts] * 3
-    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), (
-        "that of a sample's instant"
-    )
-    right = sensor_check.corrected_sequence(turned, match, rows)
-    assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(
-        400_000_000 if acts else 0
-    )
-    assert right.dvl.velocity == pytest.approx(
-        RIGHT.dvl.velocity * (1.04 if acts else 1.0)
-    )
-    assert right.calibration.dvl.mounting.rpy_rad == pytest.approx(
-        (0.3, 0.1, 0.25 if acts else 0.2)
-    )

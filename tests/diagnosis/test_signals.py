@@ -64,6 +64,15 @@ def test_a_level_way_is_turned_and_mirrored_as_it_was(angle: float, is_mirrored:
     assert found.lag.value == pytest.approx(0.0, abs=0.05)
 
 
+@pytest.mark.parametrize(("share", "is_found"), [(0.1, True), (0.5, False)])
+def test_few_outliers_change_nothing_and_many_do(share: float, is_found: bool):
+    rng = np.random.default_rng(4)
+    y = wave(T) + noise(4) + 20.0 * (rng.random(len(T)) < share)
+    found = match([SignalStretch(T, y, wave)])
+    assert (found.scatter < 2 * NOISE) == is_found
+    assert (abs(found.gain.value - 1.0) < 0.02) == is_found
+
+
 def test_intervals_cover_the_truth_with_correlated_errors():
     """Of 100 logs 95 % intervals hold 90 or more; sigmas by independent rows would hold far fewer."""
     held = 0
@@ -75,6 +84,18 @@ def test_intervals_cover_the_truth_with_correlated_errors():
         naive += error < 1.96 * found.scatter / (np.std(wave(T)) * np.sqrt(len(T)))
     assert held >= 90
     assert naive < 80
+
+
+def test_stretches_share_a_gain_and_have_an_offset_each():
+    second = T + 500.0
+    y = 1.1 * wave(second) + 40.0 + noise(8)
+    parts = [
+        SignalStretch(T, 1.1 * wave(T) - 3.0 + noise(7), wave),
+        SignalStretch(second, y, wave),
+    ]
+    found = match(parts)
+    assert found.gain.value == pytest.approx(1.1, abs=4.5 * found.gain.sigma)
+    assert found.scatter == pytest.approx(NOISE, rel=0.2)
 
 
 def test_an_interval_is_of_few_blocks_by_hand() -> None:
@@ -106,12 +127,3 @@ def test_a_reference_that_is_known_nowhere_gives_no_warning():
     found = match([at_rows], find_lag=False)
     assert found.gain.value == pytest.approx(1.0)
     assert np.isnan(found.rate)
-
-
-@pytest.mark.parametrize(("share", "is_found"), [(0.1, True), (0.5, False)])
-def test_few_outliers_change_nothing_and_many_do(share: float, is_found: bool):
-    rng = np.random.default_rng(4)
-    y = wave(T) + noise(4) + 20.0 * (rng.random(len(T)) < share)
-    found = match([SignalStretch(T, y, wave)])
-    assert (found.scatter < 2 * NOISE) == is_found
-    assert (abs(found.gain.value - 1.0) < 0.02) == is_found

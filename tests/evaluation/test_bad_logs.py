@@ -41,9 +41,34 @@ def recognised(
     return recognise_images(log, read_log(log))
 
 
+def cropped(frame: SonarFrames, bins: int) -> SonarFrames:
+    return SonarFrames(
+        frame.stamps_ns,
+        frame.intensity[:, :, :bins],
+        frame.ranges_m[:bins],
+        frame.azimuths_rad,
+    )
+
+
+def sure(found: Recognition) -> set[int]:
+    ids, probability = found.detections.most_probable()
+    return set(ids[probability > 0.9].tolist())
+
+
 @pytest.fixture(scope="module")
 def plain(lane, tmp_path_factory) -> Recognition:
     return recognised(lane, tmp_path_factory.mktemp("plain"))
+
+
+def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
+    frames = [cropped(f, 450) if k % 2 else f for k, f in enumerate(frames_of(lane))]
+    found = recognised(lane, tmp_path, frames)
+    assert sum("not used" in reason for _, reason in found.warnings) == 1
+    assert sure(found) == sure(plain)
+    stamps = [int(frame.stamps_ns[0]) for frame in frames]
+    assert {
+        stamps.index(stamp) % 2 for stamp in found.detections.stamps_ns.tolist()
+    } == {0, 1}
 
 
 def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):

@@ -102,6 +102,38 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
     assert scores["smoothed.ate_raw_m"].protocol.startswith("Smoothed")
 
 
+def test_truth_with_positions_only_scores_positions_alone(install):
+    """Nothing that needs a true orientation is scored, drawn or summed up; what is scored has the same value."""
+    whole = straight_sequence()
+    climbing = whole.truth.positions + np.linspace(0.0, 1e-3, len(whole.truth))[
+        :, None
+    ] * [0, 0, 1]
+    whole = replace(whole, truth=replace(whole.truth, positions=climbing))
+    positions = replace(
+        whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, climbing)
+    )
+    settings = {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
+    full, partial = (
+        compare(sequence, ["offset"], settings) for sequence in (whole, positions)
+    )
+    lacking = {
+        f"{kind}.{key}"
+        for kind in ("causal", "smoothed")
+        for key in (
+            "yaw_rmse_rad",
+            "nees_yaw",
+            "rpe_10s_m",
+            "rpe_10s_rad",
+        )
+    }
+    scores = partial.scores["offset"]
+    assert full.scores["offset"].keys() - {"memory.peak_mb"} - scores.keys() == lacking
+    for key, score in scores.items():
+        if not key.startswith(("time", "memory")):
+            assert score.value == full.scores["offset"][key].value, key
+    assert np.isnan(partial.errors["offset"]["causal"].yaw_rad).all()
+
+
 def test_all_are_scored_at_the_instants_that_all_have(install):
     class Late(Offset):
         def process(self, measurements: Measurements) -> Estimate | None:
@@ -347,35 +379,3 @@ def test_the_error_on_the_own_map_ignores_motion_of_the_map(
     assert "causal.own_map_m" not in both.scores["offset"], (
         "its map names two true landmarks"
     )
-
-
-def test_truth_with_positions_only_scores_positions_alone(install):
-    """Nothing that needs a true orientation is scored, drawn or summed up; what is scored has the same value."""
-    whole = straight_sequence()
-    climbing = whole.truth.positions + np.linspace(0.0, 1e-3, len(whole.truth))[
-        :, None
-    ] * [0, 0, 1]
-    whole = replace(whole, truth=replace(whole.truth, positions=climbing))
-    positions = replace(
-        whole, truth=Trajectory.of_positions(whole.truth.stamps_ns, climbing)
-    )
-    settings = {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
-    full, partial = (
-        compare(sequence, ["offset"], settings) for sequence in (whole, positions)
-    )
-    lacking = {
-        f"{kind}.{key}"
-        for kind in ("causal", "smoothed")
-        for key in (
-            "yaw_rmse_rad",
-            "nees_yaw",
-            "rpe_10s_m",
-            "rpe_10s_rad",
-        )
-    }
-    scores = partial.scores["offset"]
-    assert full.scores["offset"].keys() - {"memory.peak_mb"} - scores.keys() == lacking
-    for key, score in scores.items():
-        if not key.startswith(("time", "memory")):
-            assert score.value == full.scores["offset"][key].value, key
-    assert np.isnan(partial.errors["offset"]["causal"].yaw_rad).all()

@@ -10,6 +10,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.evaluation import Comparison, judge
 from sonar_graph.evaluation.metrics import Alignment
 from sonar_graph.report import doubt_lines
+from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.sentences import remarks
 from sonar_graph.states import Trajectory
 from tests.synthetic import basin_comparison
@@ -83,3 +84,15 @@ def test_errors_of_an_unknown_world_are_those_of_a_known_one(known, orientation)
         "the truth brought into the estimates' world"
         in found.scores["isam2"]["causal.ate_raw_m"].protocol
     )
+
+
+def test_every_word_of_the_page_says_what_was_brought_where(known):
+    fitted, told = (
+        "the truth brought into the estimates&#39; world",
+        render_report(judged(known, UNKNOWN, FAR)),
+    )
+    assert "not aligned" not in told
+    assert told.count(fitted) >= 10
+    plain = render_report(known)
+    assert fitted not in plain
+    assert "not aligned" in plain

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation import compare
+from sonar_graph.errors import EstimatorError
+from sonar_graph.estimator import is_foreign
+from sonar_graph.evaluation import check_request, compare, run_estimator
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 PLUGIN = """
@@ -137,6 +139,27 @@ def test_an_estimator_cannot_change_another_s_process(plugin, mission):
         for one, two in ((run.causal, other.causal), (run.smoothed, other.smoothed)):
             for name in ("stamps_ns", "positions", "quaternions_xyzw", "covariances"):
                 assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+
+
+def test_a_process_of_its_own_gives_the_same_numbers(plugin, mission, monkeypatch):
+    steps = []
+    apart = run_estimator(
+        mission, "dead-reckoning", progress=lambda *step: steps.append(step)
+    )
+    monkeypatch.setattr(
+        "sonar_graph.estimator.DISTRIBUTION", "another name of this package"
+    )
+    assert is_foreign("dead-reckoning")
+    told = []
+    here = run_estimator(
+        mission, "dead-reckoning", progress=lambda *step: told.append(step)
+    )
+    assert here.causal.positions.tobytes() == apart.causal.positions.tobytes()
+    assert told == steps
+    with pytest.raises(
+        EstimatorError, match=r"settings of dead-reckoning: \w+.* no such"
+    ):
+        check_request("dead-reckoning", {"wrong": 1})
 
 
 @pytest.mark.parametrize(

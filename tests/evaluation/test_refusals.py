@@ -1,5 +1,6 @@
 """Rows that estimators refuse, and what they withhold, are named to the user, from the log to the files."""
 
+import json
 import math
 from collections import Counter
 from dataclasses import replace
@@ -12,24 +13,26 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from sonar_graph.cli import main
-from sonar_graph.estimator import installed_estimators, load_estimator
+from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
 from sonar_graph.evaluation import (
     MOST_ROWS_NAMED,
     RunResult,
     gathered,
     read_comparison,
     run_estimator,
+    write_comparison,
 )
 from sonar_graph.logs import write_log
 from sonar_graph.measurements import Dvl, Heading, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
-from sonar_graph.states import Outcome, Refusal, RefusedRow
-from tests.synthetic import late, outlier
+from sonar_graph.states import Estimate, Outcome, Refusal, RefusedRow
+from tests.synthetic import late, outlier, refusing, with_run
 
 from .conftest import straight_sequence
 
+HELD_NS = 3 * 10**9, 3 * 10**9 + 500_000_000
 ESTIMATORS = list(installed_estimators())
 NS = 10**9
 
@@ -70,6 +73,34 @@ def test_few_rows_are_named_each_and_many_are_counted_by_sensor_and_reason():
         ("imu", Refusal.LATE): 9,
         ("dvl", Refusal.LATE): 1,
     }
+
+
+def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path):
+    rows = [outlier(k * NS, 50.0 + k) for k in range(8)] + [late(3)]
+    comparison = refusing(rows, "isam2", "ekf-slam")
+    comparison = with_run(
+        comparison, replace(comparison.runs[0], withheld=["landmark 3; open: z"])
+    )
+    write_comparison(comparison, tmp_path)
+    content = json.loads((tmp_path / "comparison.json").read_text())
+    told = content["runs"]["isam2"]["refused"]
+    expected = {
+        "sensor": "dvl",
+        "reason": Refusal.OUTLIER.value,
+        "count": 8,
+        "first_ns": 0,
+        "last_ns": 7 * NS,
+    }
+    assert told[0] == {**expected, "least_and_largest_distance": [50.0, 57.0]}
+    assert told[1]["least_and_largest_distance"] is None
+    restored = read_comparison(tmp_path)
+    assert [run.withheld for run in restored.runs] == [["landmark 3; open: z"], [], []]
+    for run, again in zip(comparison.runs, restored.runs, strict=True):
+        assert [row[:3] for row in again.refused] == [row[:3] for row in run.refused]
+        np.testing.assert_array_equal(
+            [row.distance for row in again.refused],
+            [row.distance for row in run.refused],
+        )
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +210,20 @@ def test_an_unsound_detection_is_named_and_changes_nothing(mission, name):
     assert sound == known.detections.outcomes
 
 
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_rows_that_a_sensor_and_a_vehicle_can_give_are_used(mission, name):
+    """The control: half a metre more of depth, and quick turns and knocks, change what comes out."""
+    clean = run_estimator(mission, name)
+    sensors = [
+        ("imu", "angular_velocity", [900], 3.0),
+        ("depth", "z_m", [40], mission.depth.z_m[40] + 0.5),
+    ]
+    for change in sensors if name != "dead-reckoning" else sensors[:1]:
+        run = run_estimator(changed(mission, *change), name)
+        assert not run.refused
+        assert not np.array_equal(run.causal.positions, clean.causal.positions)
+
+
 def off_the_clock(sequence: Sequence, rows: int, step_ns: int) -> Sequence:
     """The first rows of each sensor are stamped from zero on."""
     blocks = {}
@@ -194,6 +239,22 @@ def begun_at(sequence: Sequence, rows: int) -> Sequence:
     for sensor in ("imu", "dvl", "depth", "detections"):
         sequence = without(sequence, sensor, list(range(rows)))
     return sequence
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize(("rows", "step_ns"), [(1, 0), (3, 0), (5, NS // 10)])
+def test_first_rows_before_the_clock_was_set_are_named_and_change_nothing(
+    mission, name, rows, step_ns
+):
+    faulty = off_the_clock(mission, rows, step_ns)
+    known = begun_at(mission, rows)
+    run = run_estimator(faulty, name)
+    assert_same_numbers(run, run_estimator(known, name))
+    assert Counter((row.sensor, row.reason) for row in run.refused) == {
+        (sensor, Refusal.CLOCK): rows
+        for sensor in ("imu", "dvl", "depth", "detections")
+    }
+    assert np.array_equal(faulty.instants(2.0), known.instants(2.0))
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -224,6 +285,42 @@ def test_a_row_before_the_clock_was_set_starts_nothing(mission, name, cuts_hz):
         )
     np.testing.assert_array_equal(poses[0].positions, poses[1].positions)
     np.testing.assert_array_equal(poses[0].stamps_ns, poses[1].stamps_ns)
+
+
+def live(
+    name: str, sequence: Sequence, late: Measurements | None
+) -> tuple[Estimate | None, list[RefusedRow]]:
+    """Half a second of both sensors is missing, and perhaps comes at the end."""
+    estimator = load_estimator(name)(
+        sequence.calibration, Odometry(sequence.calibration)
+    )
+    resumed_ns = HELD_NS[1] + 4 * NS
+    for after_ns, until_ns in (
+        (0, HELD_NS[0]),
+        (HELD_NS[1], resumed_ns),
+        (resumed_ns, sequence.end_ns),
+    ):
+        imu = sequence.imu.between(after_ns, until_ns)
+        dvl = sequence.dvl.between(after_ns, until_ns)
+        estimator.process(Measurements(until_ns, imu, dvl))
+    if late is not None:
+        estimator.process(late)
+    return estimator.process(Measurements(sequence.end_ns)), refused_rows_of(estimator)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_late_rows_are_named_and_not_used(straight, name):
+    imu = straight.imu.between(*HELD_NS)
+    dvl = straight.dvl.between(*HELD_NS)
+    estimate, refused = live(name, straight, Measurements(straight.end_ns, imu, dvl))
+    other, nothing = live(name, straight, None)
+    assert not nothing
+    assert sorted((row.sensor, row.stamp_ns) for row in refused) == [
+        *(("dvl", at_ns) for at_ns in dvl.stamps_ns),
+        *(("imu", at_ns) for at_ns in imu.stamps_ns),
+    ]
+    assert {row.reason for row in refused} == {Refusal.LATE}
+    assert estimate.world_T_body.equals(other.world_T_body, 1e-9)
 
 
 def told_by(capsys: Any, *command: object) -> str:

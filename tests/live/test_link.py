@@ -15,6 +15,7 @@ from sonar_graph.live import (
     LiveOptions,
     LiveRun,
     Message,
+    Publisher,
     definition_of,
     open_link,
     open_session,
@@ -241,3 +242,24 @@ def test_a_bridge_that_is_not_there_is_named():
     pytest.importorskip("websockets")
     with pytest.raises(LogError, match=r"ws://127\.0\.0\.1:1: cannot connect"):
         open_link(["ws://127.0.0.1:1"], 0)
+
+
+def test_a_router_that_ends_and_comes_back_is_heard_again(endpoint):
+    got = []
+    router = open_session(listen=[endpoint])
+    with open_session([endpoint]) as session:
+        subscriptions = subscribe(session, 0, got.append)
+        for round_number in (1, 2):
+            publisher = Publisher(router, 0, "/imu/data", "sensor_msgs/msg/Imu")
+            last_s = time.monotonic() + 20.0
+            while (
+                len({m.sender for m in got}) < round_number
+                and time.monotonic() < last_s
+            ):
+                publisher.put(b"row")
+                time.sleep(0.05)
+            router.close()
+            router = open_session(listen=[endpoint])
+        assert len({m.sender for m in got}) == 2
+        assert subscriptions
+    router.close()

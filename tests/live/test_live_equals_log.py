@@ -197,6 +197,29 @@ def test_a_topic_that_was_chosen_may_come_late(tmp_path):
         assert sum(1 for _ in engine.steps()) > 100
 
 
+def test_several_topics_for_one_role_are_recorded_with_advice_and_can_be_chosen_from(
+    tmp_path,
+):
+    write_log(tmp_path / "log.mcap", small_world())
+    messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(5), 0.0)
+    both = [
+        again
+        for m in messages
+        for again in (
+            [m, m._replace(topic="/imu/other")] if m.topic == "/imu/data" else [m]
+        )
+    ]
+    engine, steps = live(tmp_path / "first.mcap", both)
+    assert not steps
+    assert "/imu/other" in engine.waits_for
+    assert "begin again with a choice" in engine.waits_for
+    assert sum(engine.counts.received.values()) == len(both)
+    kept = list(recorded_messages(tmp_path / "first.mcap"))
+    engine, steps = live(tmp_path / "second.mcap", kept, topics={"imu": "/imu/data"})
+    assert len(steps) > 100
+    assert engine.in_use["imu"] == "/imu/data"
+
+
 def test_a_record_that_was_begun_at_the_same_instant_is_named(tmp_path):
     with (
         LiveRecord(tmp_path / "record.mcap"),

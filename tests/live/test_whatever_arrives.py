@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sonar_graph import read_log, write_log
+from sonar_graph.devices import velocity_of_beams
 from sonar_graph.live import Engine, Message, definition_of
 from sonar_graph.live.engine import OVERLOADED
 from sonar_graph.live.live_messages import dropped_messages
@@ -327,6 +328,19 @@ def test_rotated_axes_give_the_same_bits_for_one_message_and_for_all(
 def test_a_rate_that_is_no_short_number_is_recorded_to_the_bit(tmp_path, messages):
     engine, steps = live(tmp_path / "record.mcap", messages, rate_hz=100 / 3)
     assert_equal(engine, steps, tmp_path / "record.mcap")
+
+
+def test_a_velocity_of_beams_does_not_depend_on_other_pings():
+    noise = np.random.default_rng(0)
+    directions = noise.normal(size=(4, 3))
+    along = noise.normal(size=(50, 4))
+    valid = noise.random((50, 4)) < 0.9
+    velocity, _ = velocity_of_beams(directions, along, valid, 0.01)
+    alone = [
+        velocity_of_beams(directions, along[i : i + 1], valid[i : i + 1], 0.01)[0]
+        for i in range(50)
+    ]
+    assert velocity.tobytes() == np.concatenate(alone).tobytes()
 
 
 def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):

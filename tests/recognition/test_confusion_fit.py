@@ -4,6 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
@@ -65,6 +68,20 @@ def test_a_sighting_is_of_what_truly_lies_there():
         ), place
 
 
+@given(st.integers(0, 27))
+def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
+    stamp_ns = int(lane.sequence.truth.stamps_ns[50 * second])
+    _, range_m, azimuth_rad = confusion_fit.true_objects(lane.sequence, stamp_ns)
+    motion = lane.path.at(np.array([float(second)]))
+    mounting = lane.sequence.calibration.sonar.mounting
+    body_R_sonar = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
+    for row, landmark in enumerate(lane.sequence.true_landmarks.positions):
+        in_body = motion.world_R_body[0].inv().apply(landmark - motion.position[0])
+        q = body_R_sonar.inv().apply(in_body - np.array(mounting.translation_m))
+        assert range_m[row] == pytest.approx(np.linalg.norm(q), abs=1e-6)
+        assert azimuth_rad[row] == pytest.approx(np.arctan2(q[1], q[0]), abs=1e-6)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_frames_are_enough():
     """A lane is shorter than what one would calibrate on."""
@@ -76,6 +93,24 @@ def few_frames_are_enough():
 @pytest.fixture(scope="module")
 def measured(lane_log) -> Confusion:
     return confusion_fit.calibrate([(lane_log, read_log(lane_log))])
+
+
+def test_logs_count_together(lane_log, measured):
+    run = read_log(lane_log)
+    twice = confusion_fit.calibrate(
+        [(lane_log, run), (lane_log, replace(run, notes={}))]
+    )
+    said = twice.provenance
+    once = measured.provenance
+    assert (said["logs"], said["what they are"]) == (
+        "lane.mcap, lane.mcap",
+        "a lane; recorded",
+    )
+    for name in ("frames of landmark 1", "tracks of landmark 1"):
+        assert int(said[name]) == 2 * int(once[name])
+    assert (
+        np.diag(twice.matrix) > np.diag(measured.matrix)
+    ).all()  # more tracks allow more certainty
 
 
 STRANGERS = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
@@ -259,21 +294,3 @@ def test_reports_of_a_track_are_as_many_as_the_mean_of_its_frames_is_worth(
     assert found_s == pytest.approx(
         29.5 * common * tracks / (tracks + 16), rel=0.1, abs=0.3
     )
-
-
-def test_logs_count_together(lane_log, measured):
-    run = read_log(lane_log)
-    twice = confusion_fit.calibrate(
-        [(lane_log, run), (lane_log, replace(run, notes={}))]
-    )
-    said = twice.provenance
-    once = measured.provenance
-    assert (said["logs"], said["what they are"]) == (
-        "lane.mcap, lane.mcap",
-        "a lane; recorded",
-    )
-    for name in ("frames of landmark 1", "tracks of landmark 1"):
-        assert int(said[name]) == 2 * int(once[name])
-    assert (
-        np.diag(twice.matrix) > np.diag(measured.matrix)
-    ).all()  # more tracks allow more certainty

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log, write_log
@@ -19,7 +20,7 @@ from sonar_graph.recognition import (
     with_detections,
 )
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
-from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams
+from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams, confusion_for
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 SURE = 0.9
@@ -91,6 +92,32 @@ def test_range_and_azimuth_are_as_accurate_as_their_covariance_says(lane):
     )[sure]
     assert 0.5 < nis.mean() / 2 < 2.2
     assert np.mean(nis < 9.21) > 0.93
+
+
+def test_designs_under_other_names_give_other_names(lane):
+    """Negative control: names come from the designs and from nothing else."""
+    turned = sorted(
+        (replace(d, id=d.id % 4 + 1) for d in DEFAULT_DESIGNS), key=lambda d: d.id
+    )
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(
+        update={"designs": confusion_for(turned).designs}
+    )
+    found = recognised(
+        lane, designs=turned, params=RecogniserParams(confusion=model)
+    ).detections
+    pairs = accepted(lane, found)
+    assert len(pairs) >= 3
+    assert all(named == true % 4 + 1 for true, named in pairs)
+
+
+def test_a_lane_without_landmarks_yields_none(lane):
+    """Negative control: the same frames with the order of their beams shuffled hold nothing that persists."""
+    order = np.random.default_rng(0).permutation(len(lane.frames.azimuths_rad))
+    shuffled = replace(
+        lane.frames, intensity=np.ascontiguousarray(lane.frames.intensity[:, order])
+    )
+    found = recognised(lane, one_by_one(shuffled)).detections
+    assert found is None or not accepted(lane, found)
 
 
 def test_a_log_gives_what_its_images_give(lane, lane_log, lane_recognition):
@@ -208,19 +235,6 @@ def test_a_bad_frame_is_named_in_a_warning_and_not_used(
     assert_same_detections(result.detections, without)
 
 
-def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
-    good = first_frames(lane)[:30]
-    ends_ns = [lane.sequence.start_ns - 1, lane.sequence.end_ns + 1]
-    early, late = (
-        replace(lane.one(0), stamps_ns=np.array([stamp_ns])) for stamp_ns in ends_ns
-    )
-    result = recognised(lane, [early, *good[:20], late, *good[20:]])
-    assert result.warnings == [
-        (ns, "frame not used: no IMU and Doppler log at its stamp") for ns in ends_ns
-    ]
-    assert_same_detections(result.detections, recognised(lane, good).detections)
-
-
 def test_the_notes_give_the_origin_of_detections_and_count_warnings(lane, monkeypatch):
     monkeypatch.setattr("sonar_graph.recognition.session.MOST_WARNINGS", 3)
     params = RecogniserParams(identity=IdentityParams(rule="jeffrey"))
@@ -239,6 +253,19 @@ def test_the_notes_give_the_origin_of_detections_and_count_warnings(lane, monkey
         "detections.rule": "jeffrey",
         "detections.warnings": "10 x frame not used: all samples are zero",
     }
+
+
+def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
+    good = first_frames(lane)[:30]
+    ends_ns = [lane.sequence.start_ns - 1, lane.sequence.end_ns + 1]
+    early, late = (
+        replace(lane.one(0), stamps_ns=np.array([stamp_ns])) for stamp_ns in ends_ns
+    )
+    result = recognised(lane, [early, *good[:20], late, *good[20:]])
+    assert result.warnings == [
+        (ns, "frame not used: no IMU and Doppler log at its stamp") for ns in ends_ns
+    ]
+    assert_same_detections(result.detections, recognised(lane, good).detections)
 
 
 @pytest.mark.parametrize(("lens", "is_right"), [("didson", True), ("as-logged", False)])

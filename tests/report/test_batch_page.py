@@ -10,10 +10,12 @@ import pytest
 
 from sonar_graph.batch import RecordedBatch, read_batch
 from sonar_graph.errors import EvaluationError
-from sonar_graph.report import missing_told, write_batch_report
+from sonar_graph.report import lost_told, missing_told, write_batch_report
+from sonar_graph.report.batch_figures import log_panels
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.batch_summary import absent_told, marked
 from sonar_graph.report.batch_tables import failure_table
+from sonar_graph.report.figure_style import PAGE_WIDTH_IN, colour, sized
 from tests.recorded_batches import (
     ESTIMATORS,
     LOGS,
@@ -155,3 +157,48 @@ def test_page_and_tables_count_missing_runs(incomplete, tmp_path):
         )
     )
     assert sum(int(row["not_run"]) for row in counted) == 14
+
+
+@pytest.mark.parametrize("gone", ["isam2"])
+def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone):
+    batch = drawn_batch(3)
+    for log in LOGS:
+        batch = with_missing(batch, gone, log, 3)
+    html = render_batch(batch)
+    assert "Every run that was done ended well." in html
+    assert f"({gone} 6 of 6)" in html
+
+
+def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
+    batch = drawn_batch(2)
+    write_batch(batch, tmp_path)
+    for run in batch.runs[1:]:
+        (tmp_path / run.log_file).parent.mkdir(parents=True)
+        (tmp_path / run.log_file).write_text("")
+    back = read_batch(tmp_path)
+    assert [run.log_file for run in back.runs] == [
+        "",
+        *(run.log_file for run in batch.runs[1:]),
+    ]
+    (sentence,) = lost_told(back)
+    assert sentence.startswith(
+        f"The table has 1 run whose folder is not here, first {batch.runs[0].key}"
+    )
+    assert lost_told(batch) == []
+
+
+def test_logs_stand_below_each_other_with_the_names_of_contestants_at_the_left():
+    names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(4))
+    with sized(PAGE_WIDTH_IN):
+        figure, panels = log_panels(
+            drawn_batch(1, logs=names), list(names), "error (m)"
+        )
+    assert [panel.get_title(loc="left") for panel in panels] == list(names)
+    for panel in panels:
+        labels = panel.get_yticklabels()
+        assert [label.get_text() for label in labels] == list(ESTIMATORS)
+        assert [label.get_color() for label in labels] == [colour(k) for k in range(3)]
+    figure.draw_without_rendering()
+    lows = [panel.get_tightbbox().y0 for panel in panels]
+    highs = [panel.get_tightbbox().y1 for panel in panels]
+    assert all(low >= high for low, high in zip(lows, highs[1:], strict=False))

@@ -197,6 +197,14 @@ def test_consistency_is_judged_over_runs_by_the_chi_square_band():
     assert (row["anees"], row["verdict"]) == ("", "")
 
 
+def test_sections_of_a_table_stand_in_its_csv():
+    """Of two scores of one name a paper must mark the causal one."""
+    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
+    columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
+    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 1: "Smoothed"})
+    assert [row["section"] for row in rows_of(table)] == ["Causal", "Smoothed"]
+
+
 def test_angles_are_degrees_for_people_and_radians_in_files():
     own = BATCH.values(LOGS[0], "isam2", YAW_KEY)
     table = tables.accuracy_table(BATCH, YAW)
@@ -278,6 +286,25 @@ def test_arrows_show_the_side_of_significant_differences():
     )
 
 
+def test_the_head_shows_the_first_error_that_most_logs_have():
+    assert summary.head_metric(BATCH, EVERY_METRIC) == EVERY_METRIC[0]
+    assert (
+        summary.head_metric(without(BATCH, "ate", LOGS[0]), EVERY_METRIC)
+        == EVERY_METRIC[1]
+    )
+    assert (
+        summary.head_metric(
+            replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC
+        )
+        is None
+    )
+    assert summary.head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
+    assert (
+        summary.head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name
+        == ATE.name
+    )
+
+
 def test_no_cell_of_a_table_is_a_formula_and_numbers_stay():
     cells = [
         "=1+1",
@@ -307,32 +334,3 @@ def test_no_cell_of_a_table_is_a_formula_and_numbers_stay():
             "a=b",
         )
     ]
-
-
-def test_sections_of_a_table_stand_in_its_csv():
-    """Of two scores of one name a paper must say which is causal."""
-    rows = [[Cell("RMSE"), Cell("1.0", (1.0,))] for _ in range(3)]
-    columns = [Column("metric", "Metric", is_number=False), Column("a", "a")]
-    table = Table("t", "Scores", "", columns, rows, {0: "Causal", 2: "Smoothed"})
-    assert [row["section"] for row in rows_of(table)] == [
-        *("Causal", "Causal", "Smoothed"),
-    ]
-
-
-def test_the_head_shows_the_first_error_that_most_logs_have():
-    assert summary.head_metric(BATCH, EVERY_METRIC) == EVERY_METRIC[0]
-    assert (
-        summary.head_metric(without(BATCH, "ate", LOGS[0]), EVERY_METRIC)
-        == EVERY_METRIC[1]
-    )
-    assert (
-        summary.head_metric(
-            replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC
-        )
-        is None
-    )
-    assert summary.head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
-    assert (
-        summary.head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name
-        == ATE.name
-    )

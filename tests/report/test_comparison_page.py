@@ -145,6 +145,39 @@ def test_page_is_whole_whatever_is_missing(comparison, change):
     assert re.findall(r"\b(nan|NaN|inf|None)\b", page.text) == []
 
 
+def test_without_landmarks_no_figure_of_them_is_announced(comparison):
+    alone = only(comparison, "dead-reckoning")
+    blind = replace(alone, sequence=replace(alone.sequence, detections=None))
+    unmapped = replace(blind, sequence=replace(blind.sequence, true_landmarks=None))
+    for shown, is_announced in ((alone, True), (blind, False), (unmapped, False)):
+        html = render_report(shown)
+        figures = re.findall(r'<figure id="figure-([\w-]+)"', html)
+        assert figures == [
+            *("map", "map-raw", "errors", "errors-raw", "bounds", "bounds-raw"),
+            *("yaw", "nees"),
+        ]
+        assert (
+            html.count("No run reports what became of")
+            == html.count('<a href="#detections">')
+            == is_announced
+        )
+        assert ("Ellipses hold" in html) == (shown is not unmapped)
+    assert "The log has no landmark detections" in html
+    assert {"growth", "innovations"} <= set(
+        re.findall(r'<figure id="figure-(\w+)"', render_report(comparison))
+    )
+
+
+@pytest.mark.parametrize("planar", [True, False], ids=["planar", "3-D"])
+def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
+    page = Page(render_report(basin_comparison(60, planar=planar, truth=False)))
+    assert "The log has no ground truth" in page.text
+    assert "Per update, median" in page.text
+    assert "Position error, not aligned" not in page.text
+    assert len(page.named("svg")) == 4, "the map in two widths, and no aligned view"
+    assert "show-raw" not in page.text
+
+
 def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
     same = replace(
         comparison,
@@ -260,6 +293,19 @@ def test_the_section_shows_pictures_and_counts(recognised, lane_recognition):
     assert recognition_content(basin_comparison()) is None, (
         "a comparison without images"
     )
+
+
+def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
+    warnings = [(recognised.sequence.start_ns + 1_250_000_000, "<b> & so on")]
+    warned = replace(
+        recognised, recognition=replace(recognised.recognition, warnings=warnings)
+    )
+    content = recognition_content(warned)
+    assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
+    page = render_report(warned).split('<h2 id="recognition"')[1].split("</section>")[0]
+    assert all(shown in page for shown in ("1.25", "&lt;b&gt; &amp; so on"))
+    assert "<b> & so on" not in page
+    assert page.count("data:image/jpeg;base64,") == 4
 
 
 def test_a_folder_that_cannot_be_written_is_named_in_one_line(tmp_path) -> None:

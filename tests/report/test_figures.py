@@ -13,7 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import Comparison
+from sonar_graph.evaluation import Comparison, map_instants
+from sonar_graph.evaluation.results import MapSoFar
 from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
     arrange,
@@ -23,9 +24,11 @@ from sonar_graph.report.figure_style import (
     logarithmic,
     sized,
 )
-from sonar_graph.report.figures import illustrations, map_figure
+from sonar_graph.report.figures import growth_figure, illustrations, map_figure
 from sonar_graph.report.figures.error_figures import errors_cut_off
-from tests.synthetic import basin_comparison, only
+from sonar_graph.report.figures.maps import enlargement
+from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
+from tests.synthetic import basin_comparison, only, with_failure, with_run
 
 TIME = "time since start (s)"
 DISTANCE = "distance travelled (m)"
@@ -61,6 +64,41 @@ def test_a_figure_is_a_well_formed_svg_with_units(comparison, draw):
         sequence=replace(comparison.sequence, truth=None, true_landmarks=None),
     )
     assert draw(empty) is None
+
+
+def test_names_of_crowded_landmarks_are_short_and_neither_overlap_nor_cover_a_mark():
+    """Landmarks without a name are u0, u1, ...; a name without room is left out."""
+    comparison = only(basin_comparison(60, truth=False), "isam2")
+    rng = np.random.default_rng(5)
+    for spread_m in (0.05, 1.0, 4.0):
+        points = np.column_stack([rng.normal(3.0, spread_m, (40, 2)), np.zeros(40)])
+        ids = FIRST_ANONYMOUS_ID + np.arange(40)
+        crowd = LandmarkMap(ids, points, np.tile(1e-4 * np.eye(3), (40, 1, 1)))
+        shown = with_run(comparison, replace(comparison.runs[0], landmarks=crowd))
+        with sized():
+            figure = map_figure(shown)
+        FigureCanvasAgg(figure).draw()
+        (panel,) = figure.axes
+        names = [text for text in panel.texts if text.get_text()]
+        assert names or spread_m < 1
+        assert {text.get_text() for text in names} <= {f"u{k}" for k in range(40)}
+        boxes = [text.get_window_extent() for text in names]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        marks = panel.transData.transform(points[:, :2])
+        assert not any(box.contains(*mark) for box in boxes for mark in marks)
+
+
+@pytest.mark.parametrize(
+    "limits", [(0.9, 1.1), (1.0, 9.0), (2.0, 3.0), (0.3, 40.0), (1e-3, 1e6)]
+)
+def test_a_logarithmic_axis_has_several_ticks(limits):
+    figure, axes = blank_panels(1, 1, (4.0, 3.0))
+    panel = axes[0, 0]
+    logarithmic(panel, "y")
+    panel.set_ylim(*limits)
+    ticks = panel.yaxis.get_majorticklocs()
+    assert 3 <= np.count_nonzero((ticks >= limits[0]) & (ticks <= limits[1])) <= 12
+    assert figure.axes == [panel]
 
 
 @pytest.fixture(scope="module")
@@ -169,14 +207,47 @@ def test_even_choice_keeps_the_ends(n, points):
         assert rows[-1] == n - 1
 
 
-@pytest.mark.parametrize(
-    "limits", [(0.9, 1.1), (1.0, 9.0), (2.0, 3.0), (0.3, 40.0), (1e-3, 1e6)]
-)
-def test_a_logarithmic_axis_has_several_ticks(limits):
-    figure, axes = blank_panels(1, 1, (4.0, 3.0))
-    panel = axes[0, 0]
-    logarithmic(panel, "y")
-    panel.set_ylim(*limits)
-    ticks = panel.yaxis.get_majorticklocs()
-    assert 3 <= np.count_nonzero((ticks >= limits[0]) & (ticks <= limits[1])) <= 12
-    assert figure.axes == [panel]
+def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
+    """Runs that knew one landmark more at each of three times."""
+    comparison = basin_comparison(instants)
+    stamps = map_instants(comparison.instants_ns, comparison.sequence.start_ns).tolist()
+    runs = []
+    for run in comparison.runs:
+        maps = []
+        if run.landmarks is not None:
+            covariances = np.tile(sigma_m**2 * np.eye(3), (4, 1, 1))
+            known = replace(run.landmarks, covariances=covariances)
+            rows = [slice(0, 2), slice(0, 3), slice(0, 4)]
+            maps = [
+                MapSoFar(
+                    stamp,
+                    LandmarkMap(known.ids[r], known.positions[r], known.covariances[r]),
+                )
+                for stamp, r in zip(stamps, rows, strict=True)
+            ]
+        runs.append(replace(run, maps=maps))
+    return replace(comparison, runs=runs)
+
+
+def test_ellipses_are_as_large_as_the_caption_says():
+    comparison = grown(sigma_m=0.02)
+    figure = growth_figure(comparison)
+    factor = enlargement(comparison)
+    assert factor > 1
+    ellipse = next(
+        patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)
+    )
+    assert ellipse.width == pytest.approx(
+        2 * factor * 0.02 * np.sqrt(chi2.ppf(0.95, 2))
+    )
+    assert (
+        f"drawn {factor} times as large" in illustrations(comparison)["growth"].caption
+    )
+
+
+def test_without_maps_on_the_way_the_page_says_so_and_a_failed_run_has_no_row():
+    comparison = basin_comparison(60)
+    assert growth_figure(comparison) is None
+    assert illustrations(comparison)["growth"].instead
+    figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
+    assert len(figure.axes) == 3

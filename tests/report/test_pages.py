@@ -1,5 +1,6 @@
 """Laws of both pages, of a comparison and of a batch: whole, self-contained, escaped, readable; and the front door."""
 
+import doctest
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,8 +12,13 @@ import pytest
 from sonar_graph import table
 from sonar_graph.evaluation import (
     Score,
+    comparison,
+    digits,
+    read_comparison,
+    run,
     score_table,
 )
+from sonar_graph.report import comparison_page
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.figure_style import ESTIMATOR_COLOURS
@@ -224,3 +230,27 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
     runs = [name for name in colours if name.startswith("--run-")]
     assert len(runs) == len(ESTIMATOR_COLOURS) == table.RUN_COLOURS
     assert all(contrast(colours[name], colours["--paper"]) >= 3 for name in runs)
+
+
+def test_examples_of_the_front_door_run(tmp_path):
+    for module in (comparison, run, digits, comparison_page):
+        done = doctest.testmod(module)
+        assert done.attempted > 0
+        assert done.failed == 0, module.__name__
+    compared = basin_comparison(60)
+    assert (
+        comparison_page.write_report(compared, str(tmp_path / "new"))
+        == tmp_path / "new" / "report.html"
+    )
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {
+        *(
+            "report.html",
+            "comparison.json",
+            "sequence.npz",
+            "runs",
+            ".sonar_graph.json",
+            ".lock",
+        ),
+        *("result.mcap", "result.foxglove.json", "result.rviz"),
+    }
+    assert list(read_comparison(tmp_path / "new").scores) == list(compared.scores)

@@ -3,9 +3,12 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import compare
+from sonar_graph.files import PAPER, Manifest
 from sonar_graph.report import write_paper
 from sonar_graph.report.paper import COLUMN_IN, PAGE_IN
 from sonar_graph.testing import small_world
@@ -39,6 +42,33 @@ def test_every_figure_is_written_as_svg_and_pdf(
         pdf = svg.with_suffix(".pdf").read_bytes()
         assert b"/Type3" not in pdf
         assert b"/FontFile2" in pdf, "a TrueType font, embedded"
+
+
+def test_the_same_result_gives_the_same_files_and_only_own_files_are_replaced(tmp_path):
+    comparison = basin_comparison(60)
+    write_paper(comparison, tmp_path)
+    before = {
+        path: path.read_bytes()
+        for path in tmp_path.rglob("*.*")
+        if not path.name.startswith(".")
+    }
+    write_paper(comparison, tmp_path)
+    assert before == {
+        path: path.read_bytes()
+        for path in tmp_path.rglob("*.*")
+        if not path.name.startswith(".")
+    }
+    assert Manifest.found(tmp_path).kind == PAPER
+    (tmp_path / "protocol.txt").write_text("mine")
+    with pytest.raises(
+        EvaluationError,
+        match=r"holds protocol\.txt, which sonar-graph did not write or others changed",
+    ):
+        write_paper(comparison, tmp_path)
+    write_paper(comparison, tmp_path, overwrite=True)
+    assert np.array_equal(
+        before[tmp_path / "protocol.txt"], (tmp_path / "protocol.txt").read_bytes()
+    )
 
 
 def test_without_landmarks_and_truth_what_is_left_is_written(tmp_path):

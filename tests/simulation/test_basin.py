@@ -23,6 +23,22 @@ def test_landmarks_are_where_the_paper_puts_them(published: Sequence):
     )
 
 
+def test_the_vehicle_drives_three_laps_in_the_published_time(
+    published: Sequence,
+):
+    truth = published.truth
+    assert published.duration_s == pytest.approx(2039, abs=0.2)
+    assert np.linalg.norm(truth.positions[-1] - truth.positions[0]) < 0.6
+    assert (
+        np.degrees((truth.rotations()[0].inv() * truth.rotations()[-1]).magnitude())
+        < 15
+    )
+    yaw = np.unwrap(truth.rotations().as_euler("ZYX")[:, 0])
+    assert yaw[-1] - yaw[0] == pytest.approx(-3 * 2 * np.pi, abs=0.3)
+    quarter = np.rint(yaw / (np.pi / 2))
+    assert min(np.sum(quarter == -q) / 50 for q in range(12)) > 60  # seconds
+
+
 def test_every_landmark_is_seen_each_lap_at_the_published_distance(
     published: Sequence,
 ):

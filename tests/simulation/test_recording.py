@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
+from sonar_graph.settings import parse
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.simulation.options import IMU_PRESETS
 
@@ -72,3 +74,21 @@ def test_start_is_drawn_about_the_truth_with_its_own_sigmas():
     low, high = stats.chi2.interval(0.9999, 60)
     for kind in np.moveaxis(np.array(normalised), 1, 0):
         assert low < np.sum(kind**2) < high
+
+
+def test_notes_say_what_was_simulated_and_credit_the_paper():
+    run = short(seed=9)
+    assert "basin" in run.notes["generator"]
+    assert BasinOptions.model_validate_json(run.notes["options"]).seed == 9
+    assert "laps: 1" in run.notes["ours"]
+    assert "130 s in all" in run.notes["ours"]
+    assert "laps" not in run.notes["from the paper"]
+    published = simulate_basin().notes
+    assert published["from the paper"].endswith(
+        "window, 2039 s in all, laps: 3, 0.150 m/s while driving"
+    )
+    assert "laps" not in published["ours"]
+    assert (
+        parse(Calibration, run.calibration.model_dump(mode="json"), "log")
+        == run.calibration
+    )

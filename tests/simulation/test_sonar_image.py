@@ -254,6 +254,15 @@ def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
     )
 
 
+def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
+    made = simulator([box_at(1.7, 0.3, 0.3, 0.0, 12.0)], speckle="frame")
+    bare = simulator(speckle="frame")
+    first, last = bins_at(made, 1.9, 2.0)
+    pairs = [(intensity(made, number=n), intensity(bare, number=n)) for n in range(8)]
+    on, off = np.mean(pairs, axis=0)[:, 42:54, first:last].mean(axis=(1, 2))
+    assert 10 * np.log10(on / off) == pytest.approx(12, abs=0.2)
+
+
 def point_response(**changes: object) -> np.ndarray:
     """Level of every beam around a small strong object straight ahead, in dB below its own."""
     dot = scene.place(
@@ -335,6 +344,27 @@ def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
     np.testing.assert_array_equal(level_db(told), level_db(linear))
 
 
+def test_a_seed_gives_the_same_bytes_and_only_noise_differs():
+    full = {
+        "texture_shape": 5.0,
+        "noise_db": 15.0,
+        "cross_talk_db": -25.0,
+        "multipath": True,
+        "joints": True,
+    }
+    one, again, other = (
+        simulator(seed=s, **full).frame(ABOVE, TILT, 5, 1.7) for s in (4, 4, 5)
+    )
+    np.testing.assert_array_equal(one, again)
+    assert np.mean(one != other) > 0.9
+    assert (one.dtype, one.shape) == (np.uint8, (96, 512))
+    for made, is_still in ((simulator(noise_db=15.0), False), (simulator(), True)):
+        assert (
+            np.array_equal(level_db(made, number=0), level_db(made, number=1))
+            == is_still
+        )
+
+
 @pytest.mark.parametrize("name", sorted(SONARS))
 def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypatch):
     sonar = SONARS[name]
@@ -356,6 +386,20 @@ def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypa
             span,
             255,
         )
+
+
+@pytest.mark.parametrize("span", [80.0, 100.0])
+def test_counts_are_decibels_over_the_span(span: float):
+    made = FrameSimulator(
+        PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span})
+    )
+    counts = made.frame(ABOVE, TILT, 0)
+    inside = (counts > 0) & (counts < 255)
+    assert inside.mean() > 0.9
+    found = decibels(counts, SonarImage(decibel_span=span))
+    np.testing.assert_allclose(
+        found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4
+    )
 
 
 MIDDLE_M = 1.6
@@ -426,20 +470,6 @@ def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
         (2 * reflection * steepness) ** 2 * by_hand(rise, is_ghost=True) / by_hand(rise)
     )
     assert share == pytest.approx(expected, rel=0.2)
-
-
-@pytest.mark.parametrize("span", [80.0, 100.0])
-def test_counts_are_decibels_over_the_span(span: float):
-    made = FrameSimulator(
-        PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span})
-    )
-    counts = made.frame(ABOVE, TILT, 0)
-    inside = (counts > 0) & (counts < 255)
-    assert inside.mean() > 0.9
-    found = decibels(counts, SonarImage(decibel_span=span))
-    np.testing.assert_allclose(
-        found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4
-    )
 
 
 def test_noise_adds_its_power_to_the_echo():

@@ -18,6 +18,7 @@ from sonar_graph.sonar.templates import (
     Patch,
     PolarGrid,
 )
+from sonar_graph.sonar.templates import drawn as picture_of
 
 from .polar_images import (
     AZIMUTHS_RAD,
@@ -60,6 +61,35 @@ def _fit(
             appearance.params.cell_m,
         )
     )
+
+
+def half_plane() -> LandmarkDesign:
+    """10 dB of material on the side of positive x, drawn about the middle of its edge, not about that of its figure."""
+    mask = np.full((200, 200), np.nan)
+    mask[:, 100:] = 10.0
+    return edge_in_the_middle(LandmarkDesign(1, "half", 1.0, mask, relief_m=0.0))
+
+
+def edge_in_the_middle(design: LandmarkDesign) -> LandmarkDesign:
+    vars(design)["figure_m"] = (0.0, 0.0)
+    return design
+
+
+def test_foam_that_stands_up_shows_its_near_side():
+    """2 cm of foam at a slope of tan 30 degrees: 12 mm of its near edge and their blur are brighter, no other edge."""
+    flush = half_plane()
+    raised = edge_in_the_middle(replace(flush, height_m=0.02, relief_m=0.02))
+    for heading_rad in (0.0, np.pi, np.pi / 2):
+        before, after = (
+            picture_of(one, heading_rad, 151, 0.004, (1e-3, 1e-3))[0]
+            for one in (flush, raised)
+        )
+        brighter_mm = (
+            4 * (after - before).sum(axis=0) / (10 * np.log10(1 + np.sqrt(3) ** 3))
+        )
+        np.testing.assert_allclose(
+            brighter_mm[10:65], 0.0 if heading_rad else 13.5, atol=1.5
+        )
 
 
 def test_a_patch_shows_what_a_search_along_rays_finds():
@@ -346,3 +376,13 @@ def test_a_stranger_is_none(appearance, name):
         strangers()[name], (1.7, 0.0), 0.2, ROTATION, np.random.default_rng(3)
     )
     assert odds(_fit(appearance, image, (1.7, 0.0))).max() < -2
+
+
+@pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
+def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design):
+    for y_m in np.linspace(0.34, 0.46, 7):
+        fit = _fit(appearance, image_db(design, (1.7, y_m), 0.6), (1.7, y_m - 0.02))
+        if fit is not None:
+            np.testing.assert_allclose(
+                fit.centre_m[design.id - 1], (1.7, y_m), atol=0.004
+            )

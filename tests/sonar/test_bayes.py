@@ -77,6 +77,25 @@ def test_evidence_is_bounded_and_the_order_of_frames_does_not_matter(seed: int):
     assert forth == pytest.approx(back)
 
 
+@pytest.mark.parametrize(
+    ("association", "forgetting", "expected"),
+    [
+        ([[0.0, 0.0, 1.0]], 1e-3, [0.1, 0.2, 0.7]),  # new
+        (
+            [[1.0, 0.0, 0.0]],
+            0.1,
+            [0.91, 0.02, 0.07],
+        ),  # a share returns to the belief of a new track
+        ([[0.5, 0.5, 0.0]], 0.0, [0.5, 0.5, 0.0]),  # of either track before
+    ],
+)
+def test_prediction_follows_the_association(association, forgetting, expected):
+    predicted = predict(
+        np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting
+    )
+    np.testing.assert_allclose(predicted, [expected])
+
+
 def test_news_follow_from_the_autocorrelation_of_a_triangle():
     """By numerical convolution: a lens that sends and receives weighs its aperture by a triangle."""
     places = np.linspace(-0.5, 0.5, 2001)
@@ -188,25 +207,6 @@ def test_beliefs_follow_their_tracks(is_reversed: bool):
         change, np.nan * scores, np.array([False, False]), place, sideways
     )
     np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("association", "forgetting", "expected"),
-    [
-        ([[0.0, 0.0, 1.0]], 1e-3, [0.1, 0.2, 0.7]),  # new
-        (
-            [[1.0, 0.0, 0.0]],
-            0.1,
-            [0.91, 0.02, 0.07],
-        ),  # a share returns to the belief of a new track
-        ([[0.5, 0.5, 0.0]], 0.0, [0.5, 0.5, 0.0]),  # of either track before
-    ],
-)
-def test_prediction_follows_the_association(association, forgetting, expected):
-    predicted = predict(
-        np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting
-    )
-    np.testing.assert_allclose(predicted, [expected])
 
 
 def test_motion_ahead_is_as_much_news_as_half_of_it_to_the_side():

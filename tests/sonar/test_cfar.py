@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
 from sonar_graph.devices import LandmarkDesign
@@ -10,7 +11,10 @@ from sonar_graph.measurements import Floats
 from sonar_graph.sonar import FloorView, cfar
 from sonar_graph.sonar.appearance import AppearanceParams
 from sonar_graph.sonar.regions import (
+    MEDIAN_TO_SIGMA,
     CandidateVerdict,
+    background_of,
+    measure_regions,
 )
 
 from . import polar_images
@@ -115,6 +119,26 @@ def test_a_plate_is_one_candidate_where_geometry_says(x, y):
 
 
 @pytest.mark.parametrize(
+    ("roll", "pitch", "half_rad"), [(0.0, 0.0, 0.25), (0.3, 0.5, 0.9)]
+)
+def test_the_area_of_all_of_an_image_is_that_of_its_outline_on_the_floor(
+    roll, pitch, half_rad
+):
+    """By the shoelace formula."""
+    view = FloorView.from_angles(HEIGHT_M, roll, pitch)
+    azimuths = np.linspace(half_rad, -half_rad, 192)
+    labels = np.ones((192, 512), dtype=np.int32)
+    contrast = np.zeros((192, 512), dtype=np.float32)
+    area = measure_regions(contrast, labels, 1, RANGES_M, azimuths, view).area_m2[0]
+    xy = floor_xy(view, azimuths)
+    x, y = np.concatenate(
+        [xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1
+    )
+    shoelace = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+    assert area == pytest.approx(shoelace * 192 / 191 * 512 / 511, rel=2e-3)
+
+
+@pytest.mark.parametrize(
     ("settings", "verdict"),
     [
         ({"min_area_m2": 0.2, "max_area_m2": 1.0}, CandidateVerdict.TOO_SMALL),
@@ -159,6 +183,45 @@ def test_frames_that_break_the_rules_are_refused():
     image[3, 4] = np.nan
     with pytest.raises(MeasurementError, match="finite"):
         select(image)
+
+
+BEAMS = 3
+BINS = 5
+SPAN = 9
+HALF_STEP_DB = 1 / 16
+HALF_DEVIATION_STEP_DB = 1 / 80
+
+
+def medians(values: Floats) -> Floats:
+    """Over a square window, mirrored at the edges."""
+    mirrored = np.pad(values, SPAN // 2, mode="reflect")
+    return np.median(sliding_window_view(mirrored, (SPAN, SPAN)), axis=(2, 3))
+
+
+@pytest.mark.parametrize("nodes", [20, 21])
+@pytest.mark.parametrize("shaded", [0.0, 0.4])
+def test_the_background_is_a_median_and_so_is_its_spread(nodes: int, shaded: float):
+    """A shadow 40 dB deep over less than half of the beams is below what bytes reach, -16 dB."""
+    level = np.random.default_rng(nodes).normal(40, 2, (nodes, 30)) + 0.3 * np.arange(
+        30
+    )
+    level[: int(shaded * nodes)] -= 40
+    level = level.astype(np.float32)
+    pixels = np.kron(level, np.ones((BEAMS, BINS), np.float32))
+    level_db, spread_db = background_of(
+        pixels, (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS)
+    )
+    trend = sliding_window_view(
+        np.pad(np.median(level, axis=0), 2, mode="reflect"), 5
+    ).mean(axis=1)
+    residual = level - trend
+    local = medians(np.clip(residual, -16, 127 / 8))
+    assert level_db == pytest.approx(local + trend, abs=1.01 * HALF_STEP_DB)
+    spread = MEDIAN_TO_SIGMA * medians(
+        np.minimum(np.abs(residual - (level_db - trend)), 255 / 40)
+    )
+    tolerance = MEDIAN_TO_SIGMA * 1.01 * HALF_DEVIATION_STEP_DB
+    assert spread_db == pytest.approx(np.maximum(spread, 0.2), abs=tolerance)
 
 
 PARAMS = cfar.DetectionParams()

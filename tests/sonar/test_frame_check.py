@@ -106,6 +106,17 @@ def test_good_frames_have_no_fault_on_the_scale_of_the_calibration():
     )
 
 
+def test_a_new_window_is_used_from_its_second_frame_on():
+    check = FrameCheck()
+    assert check.judge(_frame(1)) == GOOD
+    faults, changes = zip(
+        *(check.judge(_frame(n, end_m=3.0)) for n in (2, 3, 4)), strict=True
+    )
+    assert [fault is None for fault in faults] == [False, True, True]
+    assert [change is None for change in changes] == [True, False, True]
+    assert "10 x 40, 1.00 m to 3.00 m" in changes[1]
+
+
 def test_windows_that_alternate_lose_one_frame():
     check = FrameCheck()
     faults = [

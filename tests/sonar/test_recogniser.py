@@ -147,6 +147,50 @@ def test_a_track_is_reported_from_the_frame_that_is_enough(settings, y_m, reason
         assert REPORTED in outcomes_of_tracks(result)
 
 
+def test_a_track_ends_with_a_row_and_the_next_has_another_number():
+    recogniser = Recogniser(DECIBELS, params=EVERY)
+    seen = standing(recogniser, range(4), DISC)
+    assert [track.id for track in seen[-1].tracks] == [0]
+    blank = standing(recogniser, range(4, 30), None)
+    assert all(result.detections is None for result in blank)
+    ends = [outcome for result in blank for outcome in outcomes_of_tracks(result)]
+    assert "track ended: exists with less than 0.01" in ends
+    last = standing(recogniser, range(30, 36))
+    tracks = [one.detections.track.tolist() for one in last if one.detections]
+    assert len(set(map(tuple, tracks))) == 1
+    assert tracks[0] == [
+        fate.track for fate in last[-1].fates if fate.outcome == REPORTED
+    ]
+    assert tracks[0][0] > 0
+
+
+def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
+    """Patches are compared in that plane where no floor is known."""
+    scale = Calibration(
+        sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8))
+    )
+    recognisers = tuple(
+        Recogniser(of, params=EVERY) for of in (DECIBELS, scale, DECIBELS)
+    )
+    for k in range(4):
+        image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
+        given = (
+            (image, VIEW),
+            ((1e3 * 10 ** (image / 20)).astype(np.float32), VIEW),
+            (image, None),
+        )
+        found = [
+            r.process(frame(k, im), aside(0.0, k), v).detections
+            for r, (im, v) in zip(recognisers, given, strict=True)
+        ]
+    plain, linear, flat = ((one.range_m, one.azimuth_rad) for one in found)
+    np.testing.assert_allclose(linear, plain, atol=1e-4)
+    np.testing.assert_allclose(
+        found[1].id_probability, found[0].id_probability, atol=0.01
+    )
+    np.testing.assert_allclose(flat, plain, atol=0.04)
+
+
 def test_other_designs_and_blocks_of_more_frames_are_refused():
     model = RecogniserParams(confusion=confusion_for(DEFAULT_DESIGNS[:2]))
     with pytest.raises(
@@ -186,6 +230,35 @@ def test_a_bad_frame_has_no_sighting_and_its_motion_counts_once():
     assert [f.track for f in found.fates if f.track >= 0] == [
         f.track for f in expected.fates if f.track >= 0
     ]
+
+
+def test_a_sonar_that_comes_to_rest_keeps_its_belief():
+    """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
+    recogniser = Recogniser(DECIBELS, params=EVERY)
+    image = picture(SQUARE, 1.7, -0.2, 0.4, 8)
+    before = pass_by(recogniser, SQUARE)[-1]
+    for k in range(60):
+        found = recogniser.process(
+            frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW
+        ).detections
+    assert before.id_probability[0, SQUARE] > 0.9
+    np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
+
+
+def test_two_discs_at_once_are_not_both_the_disc():
+    """Two discs in one image: one is the landmark, the other is believed to be none."""
+    recogniser = Recogniser(DECIBELS, params=EVERY)
+    for k in range(9):
+        y_m = round(0.2 - 0.05 * k, 6)
+        left = picture(DISC, 1.7, y_m + 0.2, 0.4, k)
+        right = picture(DISC, 1.75, y_m - 0.2, 0.4, k)
+        found = recogniser.process(
+            frame(k, np.maximum(left, right)), aside(0.05, k), VIEW
+        ).detections
+        if found is not None and len(found) == 2:
+            pair = found.id_probability
+            assert pair.argmax(axis=1)[pair.max(axis=1) > 0.5].tolist() in ([], [DISC])
+    assert pair[:, DISC].min() == 0
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 4))

@@ -131,3 +131,31 @@ def test_what_is_not_in_view_is_compared_with_nothing(
     np.testing.assert_allclose(
         found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2])
     )
+
+
+def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image():
+    """A design drawn in that plane is found; on the floor's grid it would be foreshortened."""
+    r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
+    level = (
+        np.nan_to_num(
+            DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)
+        )
+        + 35.0
+    )
+    image = (
+        level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))
+    ).astype(np.float32)
+    r = np.hypot(1.9, 0.1)
+    a = np.arctan2(0.1, 1.9)
+    candidate = candidates_at([r], [a])
+    look = CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD)
+    flat, tilted = (
+        look.at(image, frame(image), view, candidate, np.array([0]))[0]
+        for view in (None, VIEW)
+    )
+    assert odds(flat.fit).argmax() == 1
+    assert (flat.range_m, flat.azimuth_rad) == (
+        pytest.approx(r, abs=0.006),
+        pytest.approx(a, abs=0.003),
+    )
+    assert tilted.fit is None or odds(tilted.fit)[1] < odds(flat.fit)[1] - 1

@@ -89,6 +89,34 @@ def test_the_association_is_a_distribution_whatever_the_order(counts, seed, is_c
         assert np.allclose(left, right)
 
 
+def test_association_and_existence_are_ratios_of_densities_by_hand():
+    """Two tracks side by side, each seen again where it was; what may be of something new leaves a track itself.
+
+    Then one track, and one candidate 2 cm behind it.
+    """
+    params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
+    found = run(Tracker(params), [[(2.0, 0.0), (2.0, 0.03)]] * 2)[-1]
+    # A track starts with the noise of one candidate, and the next one adds its own: twice the variance.
+    var_r = 2 * params.range_sigma_m**2
+    var_a = 2 * params.azimuth_sigma_rad**2
+    own = 0.1 / 0.6 * 0.9 / (2 * np.pi * np.sqrt(var_r * var_a))
+    other = own * np.exp(-0.5 * 0.03**2 / var_a)
+    none = 0.6 / AREA
+    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]]) / (
+        own + other + none
+    )
+    assert found.matrix == pytest.approx(expected, rel=1e-6)
+    found = run(Tracker(params), [[(2.0, 0.0)], [(2.02, 0.0)]])[-1]
+    density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
+    birth = 0.1 / 0.6
+    likelihood = 0.1 + 0.9 * density * AREA / 0.5
+    assert found.existence[0] == pytest.approx(
+        birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6
+    )
+    # between two equally certain places
+    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("range_m", "frames", "lifetime_s", "elapsed_s", "missed"),
     [(1.9, 1, 1e12, 0.1, 0.1), (1.26, 3, 1e12, 0.1, 0.55), (1.9, 1, 10.0, 10.0, 0.1)],
@@ -188,31 +216,3 @@ def test_frames_that_are_not_later_are_refused():
     for later_ns in (0, -1):
         with pytest.raises(MeasurementError, match="not later"):
             tracker.step(candidates_at([2.0], [0.0]), STILL, FRAME_NS + later_ns)
-
-
-def test_association_and_existence_are_ratios_of_densities_by_hand():
-    """Two tracks side by side, each seen again where it was; what may be of something new leaves a track itself.
-
-    Then one track, and one candidate 2 cm behind it.
-    """
-    params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
-    found = run(Tracker(params), [[(2.0, 0.0), (2.0, 0.03)]] * 2)[-1]
-    # A track starts with the noise of one candidate, and the next one adds its own: twice the variance.
-    var_r = 2 * params.range_sigma_m**2
-    var_a = 2 * params.azimuth_sigma_rad**2
-    own = 0.1 / 0.6 * 0.9 / (2 * np.pi * np.sqrt(var_r * var_a))
-    other = own * np.exp(-0.5 * 0.03**2 / var_a)
-    none = 0.6 / AREA
-    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]]) / (
-        own + other + none
-    )
-    assert found.matrix == pytest.approx(expected, rel=1e-6)
-    found = run(Tracker(params), [[(2.0, 0.0)], [(2.02, 0.0)]])[-1]
-    density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
-    birth = 0.1 / 0.6
-    likelihood = 0.1 + 0.9 * density * AREA / 0.5
-    assert found.existence[0] == pytest.approx(
-        birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6
-    )
-    # between two equally certain places
-    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
