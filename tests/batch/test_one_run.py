@@ -156,9 +156,7 @@ def map_of(sequence: Sequence) -> list[list[float]]:
     return sequence.true_landmarks.positions.tolist()
 
 
-def test_other_versions_than_planned_and_a_folder_that_cannot_be_written_are_no_result(
-    planned, tmp_path
-):
+def test_other_versions_than_planned_give_no_result(planned, tmp_path):
     run = planned()
     for changed, told in (
         (

@@ -150,7 +150,7 @@ def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
     assert len({*found, content_of("three")}) == 5
 
 
-def test_estimator_of_another_package_has_the_hash_of_that_and_one_that_cannot_be_loaded_is_planned(
+def test_an_estimator_of_another_package_has_the_hash_of_that_package(
     write_suite, misbehaving
 ):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
@@ -255,9 +255,7 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
     assert hashed() == before
 
 
-def test_hash_is_taken_once_in_a_process_and_another_sees_a_change_of_equal_size(
-    package, hashed
-):
+def test_a_hash_is_taken_once_in_a_process(package, hashed):
     before = hashed()
     code = package / "__init__.py"
     state = code.stat()

@@ -56,7 +56,7 @@ def test_the_interval_solves_halls_equation(listed):
         )
 
 
-def test_the_interval_moves_with_the_differences_is_a_point_where_they_are_equal_and_unknown_for_few():
+def test_an_interval_of_few_differences_is_unknown():
     assert np.isnan(statistics.mean_interval(np.arange(5.0))).all()
     assert np.isfinite(statistics.mean_interval(np.arange(6.0))).all()
     values = np.random.default_rng(14).exponential(0.1, 12)
@@ -300,7 +300,7 @@ def test_failure_rate_solves_wilsons_equation(counts):
     assert 0 <= rate.low <= rate.share <= rate.high <= 1
 
 
-def test_the_interval_moves_with_the_differences_and_is_a_point_where_they_are_equal():
+def test_the_interval_moves_with_the_differences():
     assert np.isnan(statistics.mean_interval(np.arange(5.0))).all()
     assert np.isfinite(statistics.mean_interval(np.arange(6.0))).all()
     values = np.random.default_rng(14).exponential(0.1, 12)

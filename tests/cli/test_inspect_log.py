@@ -40,7 +40,7 @@ def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     assert "dvl.mounting.rpy_rad" in yaw["advice"]
 
 
-def test_json_has_lever_arm_bias_and_start_as_numbers_unless_nothing_was_compared(log):
+def test_json_has_lever_arm_bias_and_start_as_numbers(log):
     said = answer(log)
     assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(
         -0.2, abs=0.1

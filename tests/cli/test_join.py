@@ -235,7 +235,7 @@ def converted(run, recorded: Path) -> Path:
     return out
 
 
-def test_navigation_that_has_images_already_is_refused_before_the_images_are_read(
+def test_navigation_that_has_images_is_refused_before_reading_others(
     lane_log, run, tmp_path, capsys
 ):
     nothing = tmp_path / "none.aris"

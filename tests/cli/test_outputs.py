@@ -53,7 +53,7 @@ def test_a_log_made_from_a_file_never_replaces_it(
     assert basin.read_bytes() == before
 
 
-def test_a_part_of_a_bag_or_a_log_under_another_ending_is_not_overwritten_either(
+def test_a_part_of_a_bag_or_a_log_of_another_ending_is_not_overwritten(
     basin, run, tmp_path, capsys
 ):
     part = tmp_path / "bag" / "bag_0.mcap"
@@ -115,9 +115,7 @@ def test_results_never_overwrite_settings_or_a_log_of_another_program(
         assert (tmp_path / path).read_bytes() == before
 
 
-def test_a_comparison_beside_the_log_can_be_repeated_and_no_file_of_it_is_both_read_and_written(
-    basin, run, tmp_path
-):
+def test_a_comparison_beside_the_log_can_be_repeated(basin, run, tmp_path):
     before = basin.read_bytes()
     for _ in range(2):
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
@@ -164,9 +162,7 @@ def test_what_another_program_wrote_is_replaced_only_when_asked_for(
     assert log.read_bytes() != before
 
 
-def test_commands_can_be_repeated_over_what_they_wrote_and_say_so_and_over_nothing(
-    run, tmp_path, capsys
-):
+def test_commands_can_be_repeated_over_what_they_wrote(run, tmp_path, capsys):
     log = tmp_path / "log.mcap"
     log.touch()  # an empty file holds nothing to lose
     for told in ("", f"Replaces {log}\n"):

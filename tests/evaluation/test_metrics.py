@@ -227,7 +227,7 @@ def test_umeyama_agrees_with_evo(seed, dimension):
     np.testing.assert_allclose(t, expected_t, atol=1e-9)
 
 
-def test_yaw_alignment_leaves_a_tilt_where_se3_removes_it_and_one_place_is_moved_to_another():
+def test_yaw_alignment_leaves_a_tilt_that_se3_removes():
     np.testing.assert_allclose(
         metrics.align_se3(np.ones((5, 3)), np.full((5, 3), 3.0)).apply(np.ones((5, 3))),
         3.0,

@@ -133,7 +133,7 @@ def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
     ]
 
 
-def test_a_page_of_an_earlier_comparison_does_not_stay_beside_the_numbers_of_a_later_one(
+def test_no_page_of_an_earlier_comparison_stays_beside_later_numbers(
     comparison, tmp_path
 ):
     write_report(comparison, tmp_path)

@@ -197,7 +197,7 @@ def test_a_topic_that_was_chosen_may_come_late(tmp_path):
         assert sum(1 for _ in engine.steps()) > 100
 
 
-def test_several_topics_for_one_role_are_recorded_with_advice_and_can_be_chosen_from(
+def test_several_topics_for_one_role_are_recorded_with_advice(
     tmp_path,
 ):
     write_log(tmp_path / "log.mcap", small_world())

@@ -427,9 +427,7 @@ def test_rows_that_are_sound_count_beside_others_that_are_not(tmp_path, messages
     assert_equal(engine, steps, tmp_path / "record.mcap")
 
 
-def test_a_topic_in_use_stays_so_when_all_begins_anew_after_another_of_its_kind_came(
-    tmp_path, messages
-):
+def test_a_topic_in_use_stays_so_when_all_begins_anew(tmp_path, messages):
     first_ns = messages[0].arrival_ns
     late = [
         m for m in messages if m.topic != DETECTIONS or m.arrival_ns > first_ns + 9 * NS

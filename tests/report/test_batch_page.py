@@ -187,7 +187,7 @@ def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
     assert lost_told(batch) == []
 
 
-def test_logs_stand_below_each_other_with_the_names_of_contestants_at_the_left():
+def test_logs_stand_below_each_other_with_contestants_at_the_left():
     names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(4))
     with sized(PAGE_WIDTH_IN):
         figure, panels = log_panels(

@@ -66,7 +66,7 @@ def test_a_figure_is_a_well_formed_svg_with_units(comparison, draw):
     assert draw(empty) is None
 
 
-def test_names_of_crowded_landmarks_are_short_and_neither_overlap_nor_cover_a_mark():
+def test_names_of_crowded_landmarks_neither_overlap_nor_cover_a_mark():
     """Landmarks without a name are u0, u1, ...; a name without room is left out."""
     comparison = only(basin_comparison(60, truth=False), "isam2")
     rng = np.random.default_rng(5)
@@ -245,7 +245,7 @@ def test_ellipses_are_as_large_as_the_caption_says():
     )
 
 
-def test_without_maps_on_the_way_the_page_says_so_and_a_failed_run_has_no_row():
+def test_without_maps_on_the_way_the_page_says_so():
     comparison = basin_comparison(60)
     assert growth_figure(comparison) is None
     assert illustrations(comparison)["growth"].instead

@@ -44,7 +44,7 @@ def test_every_figure_is_written_as_svg_and_pdf(
         assert b"/FontFile2" in pdf, "a TrueType font, embedded"
 
 
-def test_the_same_result_gives_the_same_files_and_only_own_files_are_replaced(tmp_path):
+def test_the_same_result_gives_the_same_files_and_replaces_its_own(tmp_path):
     comparison = basin_comparison(60)
     write_paper(comparison, tmp_path)
     before = {
