@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import COMPASS, EkfSlam
 from baselines.events import Motion
-from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
 from sonar_graph.measurements import Measurements
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -34,7 +33,6 @@ from .runs import (
     estimate_after,
     every_filter,
     filters_with_bias,
-    for_estimators,
     imu,
     later,
     seen,
@@ -188,26 +186,4 @@ def test_ekf_slam_on_filterpy_ends_in_the_same_state(monkeypatch, predicts_by_no
     assert_allclose(x, theirs.x, atol=1e-8)
     assert_allclose(
         P / np.outer(sigma, sigma), theirs.P / np.outer(sigma, sigma), atol=1e-8
-    )
-
-
-@for_estimators(InvariantEkf, DeadReckoning)
-def test_an_unobserved_gyro_bias_widens_yaw_as_a_constant_and_a_walk_do(kind):
-    def yaw_sigma(**noise):
-        return np.sqrt(
-            estimate_after(
-                kind, circle_calibration(**noise), CIRCLE_S, *circle()
-            ).covariance[2, 2]
-        )
-
-    none = yaw_sigma(gyro_bias_sigma=0.0, gyro_bias_walk_density=1.0)
-    some = yaw_sigma(gyro_bias_sigma=1e-3, gyro_bias_walk_density=0.0)
-    walking = yaw_sigma(gyro_bias_sigma=1e-3, gyro_bias_walk_density=1e-3)
-    start_sigma = CIRCLE_START.rpy_sigma_rad[2]
-    assert none == pytest.approx(
-        np.hypot(1e-3 * np.sqrt(CIRCLE_S), start_sigma), rel=1e-3
-    )
-    assert some == pytest.approx(np.hypot(none, 1e-3 * CIRCLE_S), rel=1e-3)
-    assert walking == pytest.approx(
-        np.hypot(some, 1e-3 * np.sqrt(CIRCLE_S**3 / 3)), rel=0.02
     )
