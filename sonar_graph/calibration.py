@@ -5,7 +5,7 @@ in its name or docstring. Every estimator gets the same one.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import gtsam
@@ -438,6 +438,20 @@ class KnownMap(Section):
     def joint(self) -> NDArray[np.float64]:
         """The joint covariance as an array, shape (3 m, 3 m), m²."""
         return np.array(self.covariance_m2, dtype=np.float64)
+
+    def without(self, ids: Collection[int]) -> Self:
+        """The map without some landmarks; at least one stays."""
+        rows = [
+            row for row, landmark_id in enumerate(self.ids) if landmark_id not in ids
+        ]
+        coordinates = np.add.outer(3 * np.array(rows), np.arange(3)).ravel()
+        P = self.joint()[np.ix_(coordinates, coordinates)]
+        kept = {
+            "ids": tuple(self.ids[row] for row in rows),
+            "positions_m": tuple(self.positions_m[row] for row in rows),
+            "covariance_m2": tuple(map(tuple, P.tolist())),
+        }
+        return self.model_copy(update=kept)
 
     @classmethod
     def of(

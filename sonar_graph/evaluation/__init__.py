@@ -2,7 +2,7 @@
 
 # fmt: off
 from sonar_graph.evaluation.comparison import LIBRARIES, compare, describe_environment, judge
-from sonar_graph.evaluation.consistency import GATED_SHARE, anees_interval, nis, normalised_squares
+from sonar_graph.evaluation.consistency import GATED_SHARE, anees_interval, likeness, nis, normalised_squares
 from sonar_graph.evaluation.digits import fixed, format_value
 from sonar_graph.evaluation.metrics import landmark_errors, rmse, scored_map, yaw_rad
 from sonar_graph.evaluation.aligned import aligned_to_truth, own_map_errors
@@ -20,7 +20,7 @@ __all__ = [
     "HEIGHTS", "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "RAW", "RefusedRows",
     "RunResult", "SCORES", "Score", "aligned_to_truth", "anees_interval",
     "check_request", "compact_table", "compare", "describe_environment", "fixed",
-    "format_value", "gathered", "headline_metric", "judge", "label", "landmark_errors", "map_instants", "nis",
+    "format_value", "gathered", "headline_metric", "judge", "label", "landmark_errors", "likeness", "map_instants", "nis",
     "normalised_squares", "one_line", "own_map_errors", "published_maps", "read_comparison",
     "repeats_published", "result_names", "rmse", "run_columns", "run_estimator", "run_here",
     "score_keys", "score_table", "scored_map", "unaligned", "write_comparison",

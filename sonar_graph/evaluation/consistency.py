@@ -3,11 +3,13 @@
 NEES and NIS: docs/theory/metrics.md (Bar-Shalom, Li, Kirubarajan 2001, section 5.4).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sonar_graph.evaluation.metrics import yaw_errors_rad
 from sonar_graph.evaluation.results import ErrorSeries
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
@@ -16,6 +18,8 @@ LEAST_SAMPLES = 10
 GATED_SHARE = 0.2
 """Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
 inside the gate then say nothing about its covariances."""
+SUCCESSIVE_S = 2.0
+"""Time between two sightings of a landmark up to which their errors are compared."""
 
 
 def error_series(
@@ -173,6 +177,56 @@ def nis(log: DetectionLog) -> Floats:
     # what the gate refused was chosen by its size, and would bias the mean
     squares = normalised_squares(log.innovations[used], log.innovation_covs[used])
     return squares[np.isfinite(squares)]
+
+
+class Likeness(NamedTuple):
+    """Correlation of the innovations of successive sightings of a landmark."""
+
+    correlation: Floats
+    """Of range and of azimuth, shape (2,); 0 where innovations are white."""
+    pairs: int
+    """Number of pairs of sightings."""
+
+
+def likeness(log: DetectionLog) -> Likeness:
+    """Correlation of innovations, over all landmarks and pairs of successive sightings that were used.
+
+    With ``u`` the innovation of range, or of azimuth, over its sigma, and the next one of the same landmark at most
+    `SUCCESSIVE_S` later::
+
+        rho = sum u_k u_k+1 / sqrt(sum u_k^2 sum u_k+1^2)
+
+    Innovations of a consistent filter are white (Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2). Errors of sightings
+    that last longer than the time between two of them are not: then covariances are too small, and NIS may still be
+    below 1.
+
+    Examples
+    --------
+    >>> from sonar_graph import run_estimator
+    >>> from sonar_graph.evaluation import likeness
+    >>> from sonar_graph.testing import small_world
+    >>> bool((abs(likeness(run_estimator(small_world(), "ekf-slam").detections).correlation) < 0.5).all())
+    True
+    """
+    is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], bool)
+    is_used &= np.isfinite(log.innovation_covs).all(axis=(1, 2))
+    variances = np.diagonal(log.innovation_covs[is_used], axis1=1, axis2=2)
+    u = log.innovations[is_used] / np.sqrt(variances)  # (n, 2)
+    ids = log.landmark_ids[is_used]
+    stamps_ns = log.stamps_ns[is_used]
+    in_turn = np.lexsort((stamps_ns, ids))
+    before = in_turn[:-1]
+    after = in_turn[1:]
+    is_pair = ids[before] == ids[after]
+    is_pair &= stamps_ns[after] - stamps_ns[before] <= SUCCESSIVE_S * NS_PER_S
+    u_k = u[before[is_pair]]
+    u_next = u[after[is_pair]]
+    squares = np.sum(u_k**2, axis=0) * np.sum(u_next**2, axis=0)
+    shared = np.sum(u_k * u_next, axis=0)
+    correlation = np.divide(
+        shared, np.sqrt(squares), out=np.zeros(2), where=squares > 0
+    )
+    return Likeness(correlation, int(is_pair.sum()))
 
 
 def mean_normalised(squares: Floats, dof: int) -> float:

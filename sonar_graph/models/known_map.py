@@ -133,12 +133,7 @@ class KnownLandmarks:
             moved = [*moved, *contradicted]
             contradicted = []
         if moved:
-            treated = (
-                "mapped again; correct the map, or its sigmas where they are too small"
-                if self._may_release
-                else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
-            )
-            lines.append(f"moved since the map was made: {named(moved)}: {treated}")
+            lines.append(moved_line(moved, is_mapped_again=self._may_release))
         if contradicted:
             lines.append(
                 f"{named(contradicted)}: sightings contradict the map, and too few others agree with it: landmarks have "
@@ -148,6 +143,16 @@ class KnownLandmarks:
         if unseen:
             lines.append(f"of the map not seen: {named(unseen)}")
         return lines
+
+
+def moved_line(ids: Collection[int], *, is_mapped_again: bool) -> str:
+    """Message about landmarks that have moved."""
+    treated = (
+        "mapped again; correct the map, or its sigmas where they are too small"
+        if is_mapped_again
+        else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
+    )
+    return f"moved since the map was made: {named(ids)}: {treated}"
 
 
 def named(ids: Collection[int]) -> str:

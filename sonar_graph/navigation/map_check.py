@@ -9,7 +9,6 @@ probable.
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
@@ -26,6 +25,7 @@ from sonar_graph.navigation.map_start import (
     candidates,
     located,
     map_data,
+    newest_of_each,
 )
 from sonar_graph.sequence import Sequence
 
@@ -154,7 +154,7 @@ def exchanged_identities(
     sightings: list[MapSighting], known: KnownMap
 ) -> list[tuple[int, int]]:
     """Pairs of identities whose exchange makes the sightings fit the map; several where they fit as well, or none."""
-    newest = newest_of_each(sightings)
+    newest = newest_of_each(sightings, NEWEST_OF_EACH)
     seen = {sighting.row for sighting in newest}
     if len(seen) < ENOUGH:
         return []
@@ -178,17 +178,6 @@ def exchanged_identities(
         return []
     ids = known.ids
     return [(ids[a], ids[b]) for fit, (a, b) in found if best - fit < math.log(ODDS)]
-
-
-def newest_of_each(sightings: list[MapSighting]) -> list[MapSighting]:
-    """The newest sightings of every landmark, in the order of time."""
-    count: Counter[int] = Counter()
-    newest = []
-    for sighting in reversed(sightings):
-        count[sighting.row] += 1
-        if count[sighting.row] <= NEWEST_OF_EACH:
-            newest.append(sighting)
-    return newest[::-1]
 
 
 def of_swaps(swaps: list[tuple[int, int]]) -> tuple[str, str]:

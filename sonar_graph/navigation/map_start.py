@@ -18,6 +18,10 @@ w is the probability of a wrong identity, and of a map of another place, in whic
 landmark count once, by their mean: a recogniser errs in the same way again. The vehicle is located when the best start
 outweighs all others together, and (3), by `ODDS`, and when its heading is known well enough to linearise at it.
 
+Landmarks that stand elsewhere have moved: the estimator gets the map without them. Some of them may also agree at a wrong
+start. For `WATCHED_S` after the first start all sightings are therefore weighed again: where a start outweighs the one in
+use by `ODDS`, the estimator begins again.
+
 Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory,
 Inference, and Learning Algorithms", 2003, chapter 28 (evidence).
 """
@@ -43,11 +47,13 @@ from sonar_graph.estimator import (
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.models import (
     ACCEPTED,
+    FEWEST,
     MINIMUM_PROBABILITY,
     elevation_on_floor,
     identify,
     listed,
     locate,
+    moved_line,
 )
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.states import (
@@ -74,6 +80,8 @@ LINEAR_SIGMAS = 3.0
 LOOSER = 3.0
 """Sigmas of the prior start over those found: the estimator weighs the same sightings itself, so that a ninth of their
 information counts twice. With a looser prior it would follow a moved landmark that it sees first."""
+WATCHED_S = 120.0
+"""Time after the vehicle was located in which a better start replaces a wrong one."""
 SAME = 10.0
 """Distance, in sigmas, of starts that are refined to the same one."""
 STEPS = 5
@@ -113,12 +121,15 @@ class MapLocator:
     def __init__(self, calibration: Calibration) -> None:
         assert calibration.map is not None
         self.found: FoundStart | None = None
+        self.moved: list[int] = []
+        """Identities of the landmarks that have moved, by the start that was found."""
         self._calibration = calibration
         self.map = calibration.map
         self._places = np.array(self.map.positions_m)
         self._rows = {landmark_id: row for row, landmark_id in enumerate(self.map.ids)}
         self._odometry = Odometry(calibration)
         self._start_ns: int | None = None
+        self._located_ns: int | None = None
         self.sightings: list[MapSighting] = []
         self._others: set[int] = set()
         """Identities that were seen and are not in the map."""
@@ -127,10 +138,26 @@ class MapLocator:
         self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
 
     def add(self, measurements: Measurements) -> None:
-        """Take in measurements, and look for the start after each frame until it is found."""
-        for _ in self.frames_seen(measurements):
+        """Take in measurements, and look for the start, or for a better one, after each frame."""
+        for stamp_ns in self.frames_seen(measurements):
+            if not self.is_watching(stamp_ns):
+                return
+            best = located(self.newest(), self.map)
+            if best is None:
+                continue
+            of_all = newest_of_each(self.sightings, MOST_OF_LANDMARK)
+            data = map_data(of_all, self.map)
             if self.found is None:
-                self.found = located(self.newest(), self.map)
+                self._located_ns = stamp_ns
+            elif not outweighs(best, self.found, data):
+                continue
+            self.found = best
+            self.moved = [self.map.ids[row] for row in moved_landmarks(best, data)]
+
+    def is_watching(self, stamp_ns: int) -> bool:
+        """True as long as the start may still change."""
+        located_ns = self._located_ns
+        return located_ns is None or stamp_ns <= located_ns + WATCHED_S * 1e9
 
     def frames_seen(self, measurements: Measurements) -> Iterator[int]:
         """Take in measurements; yields the stamp of each frame that shows landmarks of the map, once it is taken in."""
@@ -138,7 +165,7 @@ class MapLocator:
         if measurements.detections is None:
             return
         for frame in measurements.detections.frames():
-            if self.found is None and self._see(frame):
+            if self._see(frame):
                 yield int(frame.stamps_ns[0])
 
     def lacking(self) -> str:
@@ -209,13 +236,11 @@ class MapLocator:
 
     def newest(self) -> list[MapSighting]:
         """The newest sightings, a few of each landmark, in the order of time."""
-        count: Counter[int] = Counter()
-        newest = []
-        for sighting in reversed(self.sightings):
-            count[sighting.row] += 1
-            if count[sighting.row] <= MOST_OF_LANDMARK:
-                newest.append(sighting)
-        return newest[:MOST_SIGHTINGS][::-1]
+        return newest_of_each(self.sightings, MOST_OF_LANDMARK)[-MOST_SIGHTINGS:]
+
+    def standing(self) -> KnownMap:
+        """The map without the landmarks that have moved."""
+        return self.map.without(self.moved)
 
     def start(self) -> Start:
         """Prior start at the place that was found, `LOOSER` than it is known."""
@@ -240,6 +265,17 @@ class MapLocator:
                 ),
             }
         )
+
+
+def newest_of_each(sightings: list[MapSighting], most: int) -> list[MapSighting]:
+    """The newest sightings of every landmark, in the order of time."""
+    count: Counter[int] = Counter()
+    newest = []
+    for sighting in reversed(sightings):
+        count[sighting.row] += 1
+        if count[sighting.row] <= most:
+            newest.append(sighting)
+    return newest[::-1]
 
 
 def spread(
@@ -379,15 +415,11 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     agreeing = np.zeros(len(seen), bool)
     information = np.zeros((3, 3))
     for _ in range(STEPS):
-        R = turn(parameters[0])
-        e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)
-        W = R @ data.S @ R.T + data.place_cov[data.rows]  # (k, 2, 2)
-        squared = np.einsum("ki,ki->k", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
-        agrees = data.is_of & (squared <= AGREES)  # (l, k)
-        agreeing = 2 * agrees.sum(axis=1) > data.is_of.sum(axis=1)
+        agrees, agreeing = agreement(parameters, data)
         if np.count_nonzero(agreeing) < 2:
             return None
         q, S = mean_sightings(agrees[agreeing], data)  # (a, 2), (a, 2, 2)
+        R = turn(parameters[0])
         e = (data.places[seen[agreeing]] - q @ R.T - parameters[1:]).ravel()  # (2 a,)
         W = joint_covariance(R @ S @ R.T, seen[agreeing], data.M)  # (2 a, 2 a)
         by_psi = q @ turn(parameters[0] + 0.5 * math.pi).T
@@ -409,6 +441,43 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     prior = math.log(2.0 * math.pi * data.area_m2)
     rows = frozenset(seen[agreeing].tolist())
     return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
+
+
+def agreement(parameters: Floats, data: MapData) -> tuple[Any, Any]:
+    """Sightings of each landmark within the ellipse of (1), shape (l, k), and landmarks with most of them, (l,)."""
+    R = turn(parameters[0])
+    e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)
+    W = R @ data.S @ R.T + data.place_cov[data.rows]  # (k, 2, 2)
+    squared = np.einsum("ki,ki->k", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
+    agrees = data.is_of & (squared <= AGREES)
+    return agrees, 2 * agrees.sum(axis=1) > data.is_of.sum(axis=1)
+
+
+def outweighs(best: FoundStart, other: FoundStart, data: MapData) -> bool:
+    """Check that a start explains all sightings `ODDS` times better than another; drift of odometry moves both."""
+    new = refined(best.parameters, data)
+    old = refined(other.parameters, data)
+    if new is None or old is None:
+        return new is not None
+    return new.log_evidence - old.log_evidence >= math.log(ODDS)
+
+
+def moved_landmarks(start: FoundStart, data: MapData) -> list[int]:
+    """Rows of the landmarks that disagree with a start, and stand elsewhere."""
+    _, agreeing = agreement(start.parameters, data)
+    return [
+        int(data.rows[is_of][0])
+        for is_of in data.is_of[~agreeing]
+        if stands_elsewhere(is_of, data)
+    ]
+
+
+def stands_elsewhere(is_of: Any, data: MapData) -> bool:
+    """Check that a landmark that disagrees has `FEWEST` sightings in one place: wrong identities are here and there."""
+    q = data.q[is_of]
+    e = q - np.median(q, axis=0)
+    squared = np.einsum("ki,kij,kj->k", e, data.S_inv[is_of], e)
+    return bool(np.count_nonzero(squared <= AGREES) >= FEWEST)
 
 
 def joint_covariance(S: Floats, rows: Any, M: Floats) -> Floats:
@@ -447,30 +516,43 @@ def is_same(parameters: Floats, better: FoundStart) -> bool:
 class StartInMap:
     """An estimator that begins once its start is found in the map, with all measurements since the first.
 
-    `process` returns None until then.
+    `process` returns None until then. Where landmarks that are seen later refute that start, the estimator begins again.
     """
 
     def __init__(self, make: MakeEstimator, calibration: Calibration) -> None:
         self._make = make
         self._calibration = calibration
         self._locator = MapLocator(calibration)
-        self._waiting: list[Measurements] = []
+        self._since_first: list[Measurements] = []
+        """All measurements, as long as the start may change."""
+        self._begun_at: FoundStart | None = None
         self._inner: Estimator | None = None
+        self._again_s: list[float] = []
+        """Times since the first measurements at which the estimator began again."""
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Causal estimate at the end of the measurements; None as long as the vehicle is not located in the map."""
-        if self._inner is not None:
-            return self._inner.process(measurements)
-        self._waiting.append(measurements)
+        end_ns = measurements.end_ns
+        if not self._locator.is_watching(end_ns):
+            self._since_first = []
+            return None if self._inner is None else self._inner.process(measurements)
+        self._since_first.append(measurements)
         self._locator.add(measurements)
-        if self._locator.found is None:
+        found = self._locator.found
+        if found is None:
             return None
-        started = self._calibration.model_copy(update={"start": self._locator.start()})
+        if self._inner is not None and found is self._begun_at:
+            return self._inner.process(measurements)
+        if self._inner is not None:
+            self._again_s.append((end_ns - self._since_first[0].end_ns) * 1e-9)
+        started = self._calibration.model_copy(
+            update={"start": self._locator.start(), "map": self._locator.standing()}
+        )
+        self._begun_at = found
         self._inner = self._make(started, Odometry(started))
         estimate = None
-        for each in self._waiting:
+        for each in self._since_first:
             estimate = self._inner.process(each)
-        self._waiting = []
         return estimate
 
     def trajectory(self) -> Trajectory:
@@ -520,7 +602,14 @@ class StartInMap:
         """Messages of the estimator; before it begins, that the vehicle is not located."""
         if self._inner is None:
             return [f"not yet located in the map: {self._locator.lacking()}"]
-        return withheld_of(self._inner)
+        again = [
+            f"located again in the map after {after_s:.1f} s: landmarks that were seen by then contradict the place before; "
+            "causal poses until then are wrong"
+            for after_s in self._again_s
+        ]
+        moved = self._locator.moved
+        gone = [moved_line(moved, is_mapped_again=True)] if moved else []
+        return [*again, *gone, *withheld_of(self._inner)]
 
 
 def make_estimator(make: MakeEstimator, calibration: Calibration) -> Any:

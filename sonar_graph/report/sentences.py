@@ -18,11 +18,13 @@ from sonar_graph.evaluation import (
     RAW,
     Comparison,
     RefusedRows,
+    RunResult,
     Score,
     gathered,
     headline_metric,
     label,
     landmark_errors,
+    likeness,
     normalised_squares,
     scored_map,
 )
@@ -45,6 +47,11 @@ ABSURD = chi_square_quantile(1 - 1e-9, 2)
 CONTRADICTING_SHARE = 0.2
 # above this share of innovations above `ABSURD` outliers are named
 OUTLYING_SHARE = 0.05
+# correlation of the innovations of successive sightings from which they are named, and the fewest pairs of sightings
+ALIKE = 0.5
+FEWEST_PAIRS = 100
+# findings about the reference, which no estimator uses
+REFERENCE = "reference"
 MOST_NAMED = 5
 # outcomes of detections whose landmark an estimator does not know
 NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT}
@@ -101,6 +108,7 @@ def doubts(comparison: Comparison) -> list[str]:
         *doubtful[1:],
         *doubt_of_identities(comparison),
         *outliers(comparison),
+        *alike_errors(comparison),
         *(line for line in warning_lines(notes) if line not in doubtful),
         *withheld_lines(comparison),
     ]
@@ -355,24 +363,80 @@ def outliers(comparison: Comparison) -> list[str]:
     """A warning about runs that used more than `OUTLYING_SHARE` of their detections although these are absurd."""
     said = []
     for run in comparison.runs:
-        if (log := run.detections) is not None:
-            squares = normalised_squares(log.innovations, log.innovation_covs)
-            is_used = np.array(
-                [outcome is Outcome.USED for outcome in log.outcomes], np.bool_
+        far, of = absurd_detections(run)
+        if far > OUTLYING_SHARE * of:
+            said.append(
+                f"{run.estimator} {far} of {of}{_weight(flattened(run.params))}"
             )
-            squares = squares[np.isfinite(squares) & is_used]
-            if (far := np.count_nonzero(squares > ABSURD)) > OUTLYING_SHARE * len(
-                squares
-            ):
-                said.append(
-                    f"{run.estimator} {far} of {len(squares)}{_weight(flattened(run.params))}"
-                )
     if not said:
         return []
     return [
         f"{WARNING}: sonar, detections that were used although as far off as one in a billion should be: "
         f"{'; '.join(said)}: look at their ranges, azimuths and identities, then at noise and start"
     ]
+
+
+def absurd_detections(run: RunResult) -> tuple[int, int]:
+    """Detections that were used although their squared innovation exceeds `ABSURD`, and all that were used."""
+    log = run.detections
+    if log is None:
+        return 0, 0
+    squares = normalised_squares(log.innovations, log.innovation_covs)
+    is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], np.bool_)
+    squares = squares[np.isfinite(squares) & is_used]
+    return int(np.count_nonzero(squares > ABSURD)), len(squares)
+
+
+def alike_errors(comparison: Comparison) -> list[str]:
+    """A warning each for range and azimuth where successive sightings of a landmark err alike (`likeness`).
+
+    The mean of errors with the correlation rho from one to the next has ``(1 + rho) / (1 - rho)`` times the variance
+    that it has without (Bayley, Hammersley 1946). None where a sensor of the vehicle is in doubt, or innovations are
+    absurd: these are the cause then, and have lines of their own.
+    """
+    sequence = comparison.sequence
+    # the worst finding comes first
+    sensors = sequence.notes.get("log.sensors", REFERENCE)
+    if "log.doubtful" in sequence.notes or not sensors.startswith(REFERENCE):
+        return []
+    found = []
+    for run in comparison.runs:
+        far, of = absurd_detections(run)
+        if run.detections is not None and far <= OUTLYING_SHARE * of:
+            found.append((run.estimator, likeness(run.detections)))
+    noise = (
+        sequence.detections.range_azimuth_cov if sequence.detections else np.empty(0)
+    )
+    is_logged = bool(np.isfinite(noise).any())
+    sonar = sequence.calibration.sonar
+    sigmas = {
+        "range_sigma_m": sonar.range_sigma_m,
+        "azimuth_sigma_rad": sonar.azimuth_sigma_rad,
+    }
+    lines = []
+    for column, (key, sigma) in enumerate(sigmas.items()):
+        rho, pairs, name = max(
+            (
+                (float(each.correlation[column]), each.pairs, name)
+                for name, each in found
+                if each.pairs >= FEWEST_PAIRS
+            ),
+            default=(0.0, 0, ""),
+        )
+        if rho <= ALIKE:
+            continue
+        factor = float(np.sqrt((1.0 + rho) / (1.0 - rho)))
+        remedy = (
+            f"give sigmas {factor:.1f} times as large with the detections"
+            if is_logged
+            else f"write `{key} = {factor * sigma:.2g}` under [sonar]"
+        )
+        lines.append(
+            f"{WARNING}: {name}: errors of {key.split('_')[0]} are alike in successive sightings of a landmark "
+            f"(correlation {rho:.2f} in {pairs} pairs, 0 where independent): covariances are too small, also where NIS "
+            f"is below 1; {remedy}, or mend a constant error of the sonar"
+        )
+    return lines
 
 
 def _weight(settings: Mapping[str, object]) -> str:

@@ -122,6 +122,33 @@ def test_a_constant_error_is_one_independent_sample():
     assert consistency.time_average_interval(0, 1) is None
 
 
+def sightings(
+    rho: float, step_s: float = 0.5, count: int = 2000, outcome: Outcome = Outcome.USED
+) -> DetectionLog:
+    """Two landmarks in turn, their range errors with this correlation from one sighting to the next of the same."""
+    rng = np.random.default_rng(1)
+    u = rng.standard_normal((count, 2))
+    for k in range(2, count):
+        u[k, 0] = rho * u[k - 2, 0] + np.sqrt(1 - rho**2) * u[k, 0]
+    sigmas = np.array([0.2, 0.01])
+    stamps_ns = (np.arange(count) * step_s * 1e9).astype(np.int64)
+    covs = np.tile(np.diag(sigmas**2), (count, 1, 1))
+    ids = np.arange(count) % 2
+    return DetectionLog(stamps_ns, ids, u * sigmas, covs, [outcome] * count)
+
+
+def test_likeness_is_the_correlation_of_successive_sightings_of_a_landmark():
+    for rho in (0.0, 0.8):
+        found = consistency.likeness(sightings(rho))
+        assert found.pairs == 1998
+        np.testing.assert_allclose(found.correlation, [rho, 0.0], atol=0.05)
+    # sightings that are 2.2 s apart are no pairs, and what was refused is no sighting
+    assert consistency.likeness(sightings(0.8, step_s=1.1)).pairs == 0
+    refused = consistency.likeness(sightings(0.8, outcome=Outcome.GATED))
+    assert refused.pairs == 0
+    np.testing.assert_array_equal(refused.correlation, 0.0)
+
+
 def test_nis_takes_used_detections_only():
     outcomes = [Outcome.NEW, Outcome.USED, Outcome.GATED]
     covs = np.array([np.full((2, 2), np.nan), np.diag([4.0, 1.0]), np.eye(2)])

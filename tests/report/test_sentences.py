@@ -468,3 +468,28 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
     assert not said(6, off_m=0.999 * limit_m)
     assert said(6, off_m=1.001 * limit_m)
     assert not sentences.outliers(with_map(IDS, [0.0] * 4, detections=log_of([], [])))
+
+
+def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_write():
+    rng = np.random.default_rng(3)
+    noise = rng.standard_normal(400)
+
+    def said(rho: float, count: int = 400, **changes: Any) -> list[str]:
+        errors = noise[:count].copy()
+        for k in range(1, count):
+            errors[k] = rho * errors[k - 1] + np.sqrt(1 - rho**2) * noise[k]
+        log = log_of([Outcome.USED] * count, (SIGMA_M * errors).tolist())
+        comparison = with_map(IDS, [0.0] * 4, detections=log)
+        sequence = replace(comparison.sequence, **changes)
+        return sentences.alike_errors(replace(comparison, sequence=sequence))
+
+    (line,) = said(0.8)
+    rho = float(re.search(r"correlation ([.0-9]+) in 399 pairs", line)[1])
+    assert rho == pytest.approx(0.8, abs=0.1)
+    assert line.startswith("Warning: isam2: errors of range are alike")
+    assert "times as large with the detections" in line or "range_sigma_m" in line
+    assert said(0.0) == []
+    assert said(0.8, count=90) == []
+    assert said(0.8, notes={"log.doubtful": "depth against dvl: sign"}) == []
+    assert said(0.8, notes={"log.sensors": "dvl against imu: scale"}) == []
+    assert said(0.8, notes={"log.sensors": "reference against IMU: late"}) == [line]
