@@ -623,9 +623,8 @@ class FilterShell(ABC):
         landmark_id = int(views.ids[row])
         if landmark_id not in self._known.held:
             return
-        e = views.e[row]
-        squared = float(e @ np.linalg.solve(views.S[row], e))
-        if self._known.judge(landmark_id, squared) is Verdict.RELEASE:
+        verdict = self._known.judge(landmark_id, views.e[row].copy(), views.S[row])
+        if verdict is Verdict.RELEASE:
             del self._slots[landmark_id]
 
     def _bridge(self, order: Order, k: int, views: Views) -> Motion:

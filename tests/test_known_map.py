@@ -130,16 +130,17 @@ def test_landmarks_that_moved_are_named_and_mapped_anew(dive, kind):
     assert away[:2].max() < 0.3
 
 
-RIGHT = 1.0
-WRONG = 100.0
-"""Squared distances of sightings that agree with the map, and that contradict it."""
+RIGHT = (0.0, 0.0)
+WRONG = (1.0, -0.2)
+"""Innovations of range (m) and azimuth (rad) that agree with the map, and that contradict it."""
 
 
-def judged(sightings: list[tuple[int, float]]) -> KnownLandmarks:
+def judged(sightings: list[tuple[int, tuple[float, float]]]) -> KnownLandmarks:
     """A map of five landmarks after sightings."""
     known = KnownLandmarks(KnownMap.of(range(5), np.zeros((5, 3)), sigma_m=0.1))
-    for landmark_id, squared in sightings:
-        known.judge(landmark_id, squared)
+    S = np.diag([0.1, 0.02]) ** 2
+    for landmark_id, innovation in sightings:
+        known.judge(landmark_id, np.array(innovation), S)
     return known
 
 
@@ -150,6 +151,16 @@ def test_a_landmark_has_moved_if_most_of_its_sightings_contradict_it():
     assert judged(agree + [(0, RIGHT)] * 3 + [(0, WRONG)] * 3).moved == []
     both = judged(agree + [(0, WRONG)] * 3 + [(4, WRONG)] * 3)
     assert both.moved == [0, 4]
+
+
+def test_wrong_identities_here_and_there_are_no_landmark_that_moved():
+    agree = [(i, RIGHT) for i in (1, 2, 3)]
+    innovations = [(4.0, 0.3), (-2.0, 0.1), (1.0, -0.5), (6.0, 0.0)]
+    scattered = [(0, innovation) for innovation in innovations]
+    assert judged(agree + scattered).moved == []
+    # the vehicle's way changes innovations a little from one sighting to the next
+    slowly = [(0, (1.0 + 0.2 * k, -0.2)) for k in range(3)]
+    assert judged(agree + scattered + slowly).moved == [0]
 
 
 LOST = {"position_m": (300.0, -80.0, 0.0), "source": "map"}

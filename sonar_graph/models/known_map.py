@@ -1,9 +1,10 @@
 """Landmarks of a map that was given: which of them have moved since, and which are not seen.
 
 Every sighting of a landmark of the map is compared with its prediction, by the squared Mahalanobis distance of range and
-azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. A wrong identity
-contradicts seldom and here and there; a landmark that has moved is contradicted each time. So a landmark is contradicted
-from `FEWEST` contradictions on, where they are more than half of its sightings. As long as fewer landmarks are contradicted
+azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. Wrong identities
+contradict here and there; a landmark that has moved is contradicted each time, and in the same way by one sighting and the
+next. So a landmark is contradicted from `FEWEST` such contradictions in a row on, where all contradictions are more than
+half of its sightings. As long as fewer landmarks are contradicted
 than agree, it has moved, and the estimator maps it again. Where as many are contradicted, the start may be wrong, or those
 that agree have moved: then their sightings are refused, and a message names both.
 """
@@ -22,7 +23,7 @@ from sonar_graph.states import LandmarkMap
 CONTRADICTS = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
 FEWEST = 3
-"""Number of contradictions from which on a landmark may have moved."""
+"""Number of alike contradictions in a row from which on a landmark may have moved."""
 
 
 class Verdict(Enum):
@@ -48,21 +49,27 @@ class KnownLandmarks:
         """Identities with a sighting."""
         self._agreeing: Counter[int] = Counter()
         self._contradicting: Counter[int] = Counter()
+        self._last: dict[int, Floats] = {}
+        """Innovation of the last contradiction, by landmark."""
+        self._in_a_row: Counter[int] = Counter()
+        """Contradictions that are like the one before, until now."""
+        self._elsewhere: set[int] = set()
+        """Landmarks with `FEWEST` of them."""
 
     @property
     def gate(self) -> float:
         """Mahalanobis distance from which on a sighting contradicts the map."""
         return math.sqrt(CONTRADICTS)
 
-    def judge(self, landmark_id: int, squared: float) -> Verdict:
-        """Treatment of a sighting at a squared Mahalanobis distance from its prediction."""
+    def judge(self, landmark_id: int, e: Floats, S: Floats) -> Verdict:
+        """Treatment of a sighting with an innovation of range and azimuth, shape (2,), and its covariance, (2, 2)."""
         if landmark_id not in self.held:
             return Verdict.USE
         self.seen.add(landmark_id)
-        if squared <= self.gate**2:
+        if e @ np.linalg.solve(S, e) <= CONTRADICTS:
             self._agreeing[landmark_id] += 1
             return Verdict.USE
-        self._contradicting[landmark_id] += 1
+        self._contradict(landmark_id, e, S)
         contradicted = self._contradicted()
         if landmark_id not in contradicted or not self._is_outvoted(contradicted):
             return Verdict.REFUSE
@@ -73,6 +80,18 @@ class KnownLandmarks:
         self.held.discard(landmark_id)
         return Verdict.RELEASE
 
+    def _contradict(self, landmark_id: int, e: Floats, S: Floats) -> None:
+        """Count a contradiction."""
+        self._contradicting[landmark_id] += 1
+        change = e - self._last.get(landmark_id, e)
+        is_alike = change @ np.linalg.solve(2.0 * S, change) <= CONTRADICTS
+        self._last[landmark_id] = e
+        if not is_alike:
+            self._in_a_row[landmark_id] = 0
+        self._in_a_row[landmark_id] += 1
+        if self._in_a_row[landmark_id] >= FEWEST:
+            self._elsewhere.add(landmark_id)
+
     def _contradicted(self) -> list[int]:
         """Landmarks that the map still holds against most of their sightings."""
         return [
@@ -80,7 +99,7 @@ class KnownLandmarks:
             for i in self.ids
             if i in self.held
             and i not in self.moved
-            and self._contradicting[i] >= FEWEST
+            and i in self._elsewhere
             and self._contradicting[i] > self._agreeing[i]
         ]
 

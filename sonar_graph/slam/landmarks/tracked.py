@@ -396,7 +396,9 @@ class TrackedIdentities(IdentityPolicy):
         for k, sighting in enumerate(seen.sightings(rows, points)):
             squared = float(compared.distance[k])
             landmark_id = frame.ids[rows[k]]
-            verdict = self.landmarks.known.judge(landmark_id, squared)
+            verdict = self.landmarks.known.judge(
+                landmark_id, compared.innovation[k], compared.S[k]
+            )
             if verdict is Verdict.RELEASE:
                 released.append(landmark_id)
             is_inside = squared <= self._gate and verdict is Verdict.USE
