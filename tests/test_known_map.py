@@ -290,6 +290,9 @@ def test_a_start_by_landmarks_that_moved_together_is_given_up(dive, kind):
     assert max(errors.values()) > 1.0
     assert list(errors.values())[-1] < 0.2
     again, named, *_ = estimator.withheld()
+    # however the log is cut into calls
+    otherwise, _ = run(kind, with_map(dive, known, unknown_start(dive)), 0.3)
+    assert otherwise.withheld() == estimator.withheld()
     assert again.startswith("located again in the map after")
     listed = ", ".join(map(str, sorted(moved)))
     assert (

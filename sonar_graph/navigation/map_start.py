@@ -129,7 +129,8 @@ class MapLocator:
         self._rows = {landmark_id: row for row, landmark_id in enumerate(self.map.ids)}
         self._odometry = Odometry(calibration)
         self._start_ns: int | None = None
-        self._located_ns: int | None = None
+        self._found_ns: list[int] = []
+        """Frames at which the start was found, and found again."""
         self.sightings: list[MapSighting] = []
         self._others: set[int] = set()
         """Identities that were seen and are not in the map."""
@@ -147,17 +148,15 @@ class MapLocator:
                 continue
             of_all = newest_of_each(self.sightings, MOST_OF_LANDMARK)
             data = map_data(of_all, self.map)
-            if self.found is None:
-                self._located_ns = stamp_ns
-            elif not outweighs(best, self.found, data):
+            if self.found is not None and not outweighs(best, self.found, data):
                 continue
             self.found = best
+            self._found_ns.append(stamp_ns)
             self.moved = [self.map.ids[row] for row in moved_landmarks(best, data)]
 
     def is_watching(self, stamp_ns: int) -> bool:
         """True as long as the start may still change."""
-        located_ns = self._located_ns
-        return located_ns is None or stamp_ns <= located_ns + WATCHED_S * 1e9
+        return not self._found_ns or stamp_ns <= self._found_ns[0] + WATCHED_S * 1e9
 
     def frames_seen(self, measurements: Measurements) -> Iterator[int]:
         """Take in measurements; yields the stamp of each frame that shows landmarks of the map, once it is taken in."""
@@ -237,6 +236,11 @@ class MapLocator:
     def newest(self) -> list[MapSighting]:
         """The newest sightings, a few of each landmark, in the order of time."""
         return newest_of_each(self.sightings, MOST_OF_LANDMARK)[-MOST_SIGHTINGS:]
+
+    def again_s(self) -> list[float]:
+        """Times since the start at which a better one replaced it."""
+        first_ns = self._start_ns or 0
+        return [(stamp_ns - first_ns) * 1e-9 for stamp_ns in self._found_ns[1:]]
 
     def standing(self) -> KnownMap:
         """The map without the landmarks that have moved."""
@@ -523,35 +527,38 @@ class StartInMap:
         self._make = make
         self._calibration = calibration
         self._locator = MapLocator(calibration)
-        self._since_first: list[Measurements] = []
-        """All measurements, as long as the start may change."""
+        self._since_first: list[Measurements] | None = []
+        """All measurements; None once the start no longer changes."""
         self._begun_at: FoundStart | None = None
         self._inner: Estimator | None = None
-        self._again_s: list[float] = []
-        """Times since the first measurements at which the estimator began again."""
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Causal estimate at the end of the measurements; None as long as the vehicle is not located in the map."""
-        end_ns = measurements.end_ns
-        if not self._locator.is_watching(end_ns):
-            self._since_first = []
+        if self._since_first is None:
             return None if self._inner is None else self._inner.process(measurements)
         self._since_first.append(measurements)
         self._locator.add(measurements)
+        estimate = self._estimate(measurements, self._since_first)
+        if not self._locator.is_watching(measurements.end_ns):
+            self._since_first = None
+        return estimate
+
+    def _estimate(
+        self, newest: Measurements, since_first: list[Measurements]
+    ) -> Estimate | None:
+        """Estimate by the newest measurements; where the start has changed, by all of them."""
         found = self._locator.found
         if found is None:
             return None
         if self._inner is not None and found is self._begun_at:
-            return self._inner.process(measurements)
-        if self._inner is not None:
-            self._again_s.append((end_ns - self._since_first[0].end_ns) * 1e-9)
+            return self._inner.process(newest)
         started = self._calibration.model_copy(
             update={"start": self._locator.start(), "map": self._locator.standing()}
         )
         self._begun_at = found
         self._inner = self._make(started, Odometry(started))
         estimate = None
-        for each in self._since_first:
+        for each in since_first:
             estimate = self._inner.process(each)
         return estimate
 
@@ -605,7 +612,7 @@ class StartInMap:
         again = [
             f"located again in the map after {after_s:.1f} s: landmarks that were seen by then contradict the place before; "
             "causal poses until then are wrong"
-            for after_s in self._again_s
+            for after_s in self._locator.again_s()
         ]
         moved = self._locator.moved
         gone = [moved_line(moved, is_mapped_again=True)] if moved else []
