@@ -53,6 +53,7 @@ from sonar_graph.numerics import (
     exp_and_mean,
     inlined,
     mat,
+    row_of,
     skew,
     store,
     store6,
@@ -504,12 +505,6 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
         else:
             high = middle
     return low
-
-
-@inlined
-def row_of(A: Floats, k: int) -> Vec3:
-    """Row k of an array of shape (n, 3) (a view of it would be slow to compile)."""
-    return Vec3(A[k, 0], A[k, 1], A[k, 2])
 
 
 @inlined

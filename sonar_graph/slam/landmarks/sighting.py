@@ -7,6 +7,7 @@ belong to its earliest sighting (docs/theory/identities.md).
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import compress
 
 import gtsam
@@ -169,9 +170,13 @@ class SeenFrame:
     """Landmarks that other detections of the frame show."""
     factors: SightingFactors
 
+    @cached_property
+    def _beams(self) -> tuple[Floats, Floats]:
+        return self.view.beams(self.frame.z)
+
     def beam_points(self, rows: list[int]) -> Floats:
         """Points of the world at the measured range and azimuth and elevation 0, shape (len(rows), 3), m."""
-        return self.view.beam_points(self.frame.z[rows])
+        return self._beams[0][rows]
 
     def sightings(
         self, rows: list[int], points: Floats, elevation_rad: float = 0.0
@@ -197,22 +202,23 @@ class SeenFrame:
                 row=frame.rows[row],
                 line=Sightline(self.tie.pose_key, keyframe_T_sonar, frame.z[row]),
                 noise=R,
-                floor=floor,
+                floor=self.floors[row],
                 elevation_rad=elevation_rad,
             )
-            for row, R, floor in zip(rows, noise, self.floors_under(rows), strict=True)
+            for row, R in zip(rows, noise, strict=True)
         ]
 
-    def floors_under(self, rows: list[int]) -> list[FloorPrior | None]:
+    @cached_property
+    def floors(self) -> list[FloorPrior | None]:
         """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
         floor = self.factors.floor
         if floor is None:
-            return [None] * len(rows)
-        points = self.beam_points(rows)
+            return [None] * len(self.frame)
+        points, variance = self._beams
         # an elevation of e raises the point by e times the range along the sonar's z axis
-        slope_m = self.frame.z[rows, 0] * self.view.world_z_by_elevation()
-        by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
-        variance = by_elevation + self.view.height_variances(points) + floor.sigma_m**2
+        slope_m = self.frame.z[:, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
+        variance = variance + np.square(slope_m * self.factors.elevation_sigma_rad)
+        variance += floor.sigma_m**2
         # an object on a wall or a wreck must not be pulled to the floor
         is_on_floor = np.square(points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
         return [floor if is_on else None for is_on in is_on_floor.tolist()]

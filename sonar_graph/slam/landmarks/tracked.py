@@ -419,7 +419,7 @@ class TrackedIdentities(IdentityPolicy):
         frame = seen.frame
         z = frame.z[row]
         elevation_rad = seen.factors.elevation_on(
-            seen.floors_under([row])[0], seen.view.world_T_sonar, z
+            seen.floors[row], seen.view.world_T_sonar, z
         )
         start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
         # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
