@@ -391,11 +391,12 @@ class Odometry:
         epochs_ns = self.epochs(start_ns - 1, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
-        stretch = Stretch.begin(start_ns, removed.bias)
         key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
         kept = self._kept
         if kept is not None and kept.key == key and kept.stretch.until_ns <= newest_ns:
             stretch = kept.stretch
+        else:
+            stretch = Stretch.begin(start_ns, removed.bias)
 
         if stretch.until_ns < newest_ns:
             new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
@@ -405,7 +406,8 @@ class Odometry:
                     rows.known(known_ns), sensors, removed, start_ns, found_ns
                 )
                 stretch = Stretch.begin(found_ns, removed.bias, over_gap)
-            for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
+            is_gap = new_ns[1:] - new_ns[:-1] > sensors.longest_ns
+            for k in is_gap.nonzero()[0].tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
                 before = stretch.continued(

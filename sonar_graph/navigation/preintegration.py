@@ -192,14 +192,14 @@ def add_to(
     sums: Floats, rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
 ) -> tuple[Floats, Floats]:
     """Add the steps of intervals to their sums, shape (n, 20, 3); returns covariances and derivatives by the bias."""
-    return add_steps(
-        rows,
-        intervals,
-        sensors.gyro_density,
-        sensors.body_p_dvl,
-        *removed,
-        sums.reshape(-1, 3),
+    n = len(sums)
+    C = np.empty((n, 6, 6))
+    D = np.empty((n, 6, 3))
+    constants = (sensors.body_p_dvl, *removed)
+    add_steps(
+        rows, intervals, sensors.gyro_density, constants, (sums.reshape(-1, 3), C, D)
     )
+    return C, D
 
 
 def motions_over(
@@ -323,18 +323,16 @@ def add_steps(
     rows: Rows,
     intervals: Intervals,
     gyro_density: float,
-    body_p_dvl: Floats,
-    bias: Floats,
-    earth: Floats,
-    sums: Floats,
-) -> tuple[Floats, Floats]:
-    """Add steps to the sums of n intervals, shape (20 n, 3), in place; return C, shape (n, 6, 6), and D, (n, 6, 3).
+    constants: tuple[Floats, Floats, Floats],
+    found: tuple[Floats, Floats, Floats],
+) -> None:
+    """Add steps to the sums of n intervals, shape (20 n, 3), and fill in C, shape (n, 6, 6), and D, (n, 6, 3).
 
-    ``bias`` and ``earth`` are those of `Removed`. Each named tuple costs a call a microsecond and more.
+    ``constants`` are ``body_p_dvl``, and bias and Earth's rotation of `Removed`. Arrays that are returned cost microseconds.
     """
+    body_p_dvl, bias, earth = constants
+    sums, C, D = found
     n = len(intervals.start_ns)
-    C = np.empty((n, 6, 6))
-    D = np.empty((n, 6, 3))
     b = vec(bias)
     E = vec(earth)
     lever = vec(body_p_dvl)
@@ -404,7 +402,6 @@ def add_steps(
         store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C[e])
         store(to_j.a @ D_t, D[e])
         store(to_j.c @ D_t + to_j.d @ D_r, D[e], LOWER_LEFT)
-    return C, D
 
 
 @inlined

@@ -187,18 +187,6 @@ class Estimates:
         """True for a variable that is in the window, not only about to be."""
         return self.exists(key) and not self.new.exists(key)
 
-    def atPose3(self, key: int) -> gtsam.Pose3:
-        """Pose of a keyframe; the name is GTSAM's."""
-        return self._at(key)
-
-    def atPoint3(self, key: int) -> Floats:
-        """Position of a landmark; the name is GTSAM's."""
-        return self._at(key)
-
-    def atVector(self, key: int) -> Floats:
-        """Biases; the name is GTSAM's."""
-        return self._at(key)
-
     def _at(self, key: int) -> Any:
         # a frame uses the same few variables several times
         known = self._known.get(key)
@@ -209,6 +197,13 @@ class Estimates:
             known = source.atPose3(key) if is_pose(key) else source.atVector(key)
             self._known[key] = known
         return known
+
+    atPose3 = _at
+    """Pose of a keyframe; these names are GTSAM's."""
+    atPoint3 = _at
+    """Position of a landmark."""
+    atVector = _at
+    """Biases."""
 
     def all(self) -> gtsam.Values:
         """All variables, as a copy."""
@@ -266,6 +261,8 @@ class Smoother:
         self._times_s: dict[int, float] = {}
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
+        self._in_reach: list[int] = []
+        """Landmarks in reach at the last step."""
         self._newest_bias: int | None = None
         self._refused: set[int] = set()
         self._left: set[int] = set()
@@ -504,6 +501,7 @@ class Smoother:
         """One Gauss-Newton step of the window; False where it failed, and the window was restarted."""
         window = self._window
         store = self._store
+        self._in_reach = self._landmarks_in_reach()
         try:
             if isinstance(window, WholeWindow):
                 window.update(
@@ -711,9 +709,7 @@ class Smoother:
 
     def _likely(self) -> list[int]:
         """Landmarks in the window that the next frame may show."""
-        return [
-            key for key in self._landmarks_in_reach() if self.estimates.is_taken_up(key)
-        ]
+        return [key for key in self._in_reach if self.estimates.is_taken_up(key)]
 
     def _asked_next(self) -> list[int]:
         """Variables whose covariance is needed next: newest keyframe and biases, and landmarks in reach."""
@@ -721,7 +717,7 @@ class Smoother:
         newest = [
             key for key in (self._newest_pose, self._newest_bias) if key is not None
         ]
-        return self.in_window(newest) + self._landmarks_in_reach()
+        return self.in_window(newest) + self._in_reach
 
     def _landmarks_in_reach(self) -> list[int]:
         """Landmarks within `REACH` times the longest range measured so far from the newest keyframe."""
@@ -736,8 +732,9 @@ class Smoother:
             (new if new.exists(key) else linearised_at).atPoint3(key)
             for key in self._landmarks
         ]
-        distances_m = np.linalg.norm(np.array(points_m) - position_m, axis=1)
-        return list(compress(self._landmarks, (distances_m <= reach_m).tolist()))
+        d = np.array(points_m) - position_m
+        is_near = np.vecdot(d, d) <= reach_m**2
+        return list(compress(self._landmarks, is_near.tolist()))
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables, from the batch solution if one has left the window."""
