@@ -144,7 +144,11 @@ class Block:
             and len(self.stamps_ns[selection])
         ):
             # as the whole is
-            return self.of_valid(*(column[selection] for column in vars(self).values()))
+            block = object.__new__(type(self))
+            vars(block).update(
+                {name: column[selection] for name, column in vars(self).items()}
+            )
+            return block
         return type(self)(
             *(getattr(self, column.name)[selection] for column in fields(self))
         )

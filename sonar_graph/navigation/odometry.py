@@ -365,7 +365,7 @@ class Odometry:
                 "motion: needs rows of IMU and Doppler log; add them first"
             )
         for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
-            if not isinstance(instant, int | np.integer):
+            if not isinstance(instant, (int, np.integer)):
                 raise MeasurementError(
                     f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row"
                 )

@@ -133,12 +133,12 @@ def split_at(
     blocks: list[Block], interval: Interval
 ) -> tuple[Block | None, list[Block]]:
     """Samples of an interval as one block, None without any, and the blocks of later samples."""
-    parts = [block.between(interval.start_ns, interval.node_ns) for block in blocks]
-    rests = [block.between(interval.node_ns, LATEST_NS) for block in blocks]
-    inside = [part for part in parts if part is not None]
-    later = [rest for rest in rests if rest is not None]
-    together = type(inside[0]).concatenate(inside) if inside else None
-    return together, later
+    if not blocks:
+        return None, []
+    together = type(blocks[0]).concatenate(blocks)
+    inside = together.between(interval.start_ns, interval.node_ns)
+    later = together.between(interval.node_ns, LATEST_NS)
+    return inside, [] if later is None else [later]
 
 
 class Average(NamedTuple):
@@ -164,11 +164,11 @@ def average_at_end(variance: Floats, wander: Floats) -> Average:
     wander
         q: variance of the odometry from each sample to the next, and from the last to the end, shape (n,).
     """
-    gains: list[float] = []
-    P = np.inf
-    for r, q in zip(variance.tolist(), wander.tolist(), strict=True):
-        K = P / (P + r) if gains else 1.0
-        P = ((1.0 - K) * P if gains else r) + q
+    gains = [1.0]
+    P = float(variance[0] + wander[0])
+    for r, q in zip(variance[1:].tolist(), wander[1:].tolist(), strict=True):
+        K = P / (P + r)
+        P = (1.0 - K) * P + q
         gains.append(K)
     # older samples share the odometry's error: they give way together
     weights = np.array(gains)
@@ -222,6 +222,7 @@ class Keyframes:
         lag_s = min(smoother.params.lag_s, LONGEST_LATE_S)
         self._lag_ns = round(lag_s * NS_PER_S)
         self._bias_since_ns = 0
+        self._newest_key = X(0)
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._linearised: Linearisation
         self._depths: list[Depth] = []
@@ -245,7 +246,7 @@ class Keyframes:
     @property
     def newest_key(self) -> int:
         """Key of the newest keyframe."""
-        return X(len(self.stamps_ns) - 1)
+        return self._newest_key
 
     def tie(self, motion: PreintegratedMotion) -> Tie:
         """An instant that the motion from the newest keyframe leads to."""
@@ -378,16 +379,12 @@ class Keyframes:
 
     def _is_blurred(self, motion: PreintegratedMotion) -> bool:
         """True when the variance of a motion exceeds ``motion_noise_share`` of the sonar's variance."""
-        # (6,)
-        variances = motion.covariance.diagonal() + self._by_biases(motion.D_bias)
+        by_biases = np.square(motion.D_bias) @ self._bias_variances
+        variances = (motion.covariance.diagonal() + by_biases).tolist()  # (6,)
         sonar = self.calibration.sonar
-        turn_share = float(variances[:3].max()) / sonar.azimuth_sigma_rad**2
-        way_share = float(variances[3:].max()) / sonar.range_sigma_m**2
+        turn_share = max(variances[:3]) / sonar.azimuth_sigma_rad**2
+        way_share = max(variances[3:]) / sonar.range_sigma_m**2
         return max(turn_share, way_share) > self.params.motion_noise_share
-
-    def _by_biases(self, D: Floats) -> Floats:
-        """Variances that the biases cause by a derivative, as uncertain as at the start: shape (m, 11) to (m,)."""
-        return np.asarray(np.square(D) @ self._bias_variances)
 
     def _shared_over_gap(
         self, since_ns: int, stamp_ns: int, motion: PreintegratedMotion
@@ -426,6 +423,7 @@ class Keyframes:
         # the factors up to here hold for the biases of keyframe i
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
+        self._newest_key = X(j)
         self._constrain(j)
         self.odometry.settle(node_ns)
         # a late fix may need the motion from any keyframe of the lag

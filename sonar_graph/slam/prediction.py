@@ -33,7 +33,6 @@ from sonar_graph.numerics import (
     LOWER_LEFT,
     LOWER_RIGHT,
     UPPER_LEFT,
-    Mat3,
     Vec3,
     Vec6,
     compiled,
@@ -47,7 +46,6 @@ from sonar_graph.numerics import (
     store,
     store_row,
     store_row6,
-    vec,
 )
 from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
 from sonar_graph.states import Estimate, Trajectory
@@ -58,10 +56,10 @@ NO_BIASES = np.zeros((6, 0))
 
 
 # numba takes longer to recognise a named tuple, or to return an array, than to evaluate a frame
-Moved = tuple[Floats, Floats, Floats, Floats]
-"""Motion as arrays: rotation, displacement, D, shape (6, 11) or `NO_BIASES`, and Q."""
-SonarOnBody = tuple[Floats, Floats, Floats, Floats]
-"""Rotation and position of the body in the world, and of the sonar in the body."""
+Moved = tuple[Floats, Floats, Floats]
+"""Motion as arrays: mean, shape (4, 4), D, shape (6, 11) or `NO_BIASES`, and Q."""
+SonarOnBody = tuple[Floats, Floats]
+"""Pose of the body in the world, and of the sonar in the body, shape (4, 4)."""
 
 
 class Tie(NamedTuple):
@@ -83,7 +81,7 @@ class Tie(NamedTuple):
     def moved(self, i_T_j: gtsam.Pose3) -> Moved:
         """The motion as arrays, with the mean as corrected for biases."""
         D = NO_BIASES if self.bias_key is None else self.motion.D_bias
-        return (*as_arrays(i_T_j), D, self.motion.covariance)
+        return i_T_j.matrix(), D, self.motion.covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +233,8 @@ class PredictedView:
         self.world_T_sonar = world_T_body.compose(body_T_sonar)
         """Pose of the sonar at the frame."""
         self._tie = tie
-        self._keyframe = as_arrays(world_T_keyframe)
-        self._sonar = (*as_arrays(world_T_body), *as_arrays(body_T_sonar))
+        self._keyframe = world_T_keyframe.matrix()
+        self._sonar = world_T_body.matrix(), body_T_sonar.matrix()
         self._covariance = covariance
 
     def beams(self, z: Floats) -> tuple[Floats, Floats]:
@@ -364,11 +362,11 @@ def write_compared(
 @inlined
 def by_state(moved: Moved) -> Floats:
     """J of (1), shape (6, n): by the keyframe, then by the biases if the motion depends on them."""
-    dR, dp, D, _ = moved
+    i_T_j, D, _ = moved
     J = np.zeros((6, 6 + D.shape[1]))
-    R_inverse = mat(dR).T
+    R_inverse = mat(i_T_j).T
     store(R_inverse, J, UPPER_LEFT)  # Ad(M^-1)
-    store(-1.0 * (R_inverse @ skew(vec(dp))), J, LOWER_LEFT)
+    store(-1.0 * (R_inverse @ skew(position(i_T_j))), J, LOWER_LEFT)
     store(R_inverse, J, LOWER_RIGHT)
     J[:, 6:] = D
     return J
@@ -399,7 +397,7 @@ def joint_of(P: Floats, rows: Ints, biases: int) -> Floats:
 def write_carried(moved: Moved, P: Floats, rows: Ints, found: Floats) -> None:
     """Fill in (1), shape (6, 6); P and rows are those of `joint_of`."""
     J = by_state(moved)
-    _, _, D, Q = moved
+    _, D, Q = moved
     _, JPJ_Q = innovation_of(joint_of(P, rows, D.shape[1]), J, Q)
     found[:] = JPJ_Q
 
@@ -417,17 +415,18 @@ def write_expected(
 
     P and rows are those of `joint_of`.
     """
-    R, X, body_R_sonar, body_p_sonar = sonar
-    _, _, D, Q = moved
+    world_T_body, body_T_sonar = sonar
+    _, D, Q = moved
     expected, S_0 = found
     m = len(points)
-    mount = Mount(body_R_sonar, body_p_sonar)
+    mount = Mount(body_T_sonar, body_T_sonar[:3, 3])
     J = by_state(moved)
     n = J.shape[1]
     H = np.zeros((2 * m, n + 3 * m))
     H_M = np.empty((2 * m, 6))
     for k in range(m):
-        sight = sight_of(mat(R), vec(X), mount, row_of(points, k))
+        point = row_of(points, k)
+        sight = sight_of(mat(world_T_body), position(world_T_body), mount, point)
         expected[k, 0] = sight.range_m
         expected[k, 1] = sight.azimuth_rad
         store_row6(sight.range_by_body, H_M, 2 * k, 0)
@@ -446,10 +445,11 @@ def write_expected(
 @compiled
 def blur(sonar: SonarOnBody, C: Floats, points: Floats, noise: Floats) -> None:
     """Add to the noise of range and azimuth of points, (m, 2, 2), their variances by the covariance C of the body."""
-    R, X, body_R_sonar, body_p_sonar = sonar
-    mount = Mount(body_R_sonar, body_p_sonar)
+    world_T_body, body_T_sonar = sonar
+    mount = Mount(body_T_sonar, body_T_sonar[:3, 3])
     for k in range(len(points)):
-        sight = sight_of(mat(R), vec(X), mount, row_of(points, k))
+        point = row_of(points, k)
+        sight = sight_of(mat(world_T_body), position(world_T_body), mount, point)
         noise[k, 0, 0] += sight.range_by_body @ (mat6(C) @ sight.range_by_body)
         noise[k, 1, 1] += sight.azimuth_by_body @ (mat6(C) @ sight.azimuth_by_body)
 
@@ -457,32 +457,33 @@ def blur(sonar: SonarOnBody, C: Floats, points: Floats, noise: Floats) -> None:
 @compiled
 def write_beams(
     sonar: SonarOnBody,
-    keyframe: tuple[Floats, Floats],
+    world_T_keyframe: Floats,
     covariances: tuple[Floats, Floats],
     z: Floats,
     found: tuple[Floats, Floats],
 ) -> None:
     """Fill in points and variances of `PredictedView.beams`; covariances of the keyframe's pose and of the motion."""
-    R, X, body_R_sonar, body_p_sonar = sonar
-    keyframe_R, keyframe_X = keyframe
+    world_T_body, body_T_sonar = sonar
     P, Q = covariances
     points, variance = found
     for k in range(len(z)):
         on_beam = Vec3(z[k, 0] * math.cos(z[k, 1]), z[k, 0] * math.sin(z[k, 1]), 0.0)
-        point = vec(X) + mat(R) @ (vec(body_p_sonar) + mat(body_R_sonar) @ on_beam)
+        q = position(body_T_sonar) + mat(body_T_sonar) @ on_beam
+        point = position(world_T_body) + mat(world_T_body) @ q
         store_row(point, points, k, 0)
-        h = height_by_body(mat(keyframe_R), vec(keyframe_X), point)
-        h_M = height_by_body(mat(R), vec(X), point)
+        h = height_by_body(world_T_keyframe, point)
+        h_M = height_by_body(world_T_body, point)
         variance[k] = h @ (mat6(P) @ h) + h_M @ (mat6(Q) @ h_M)
 
 
 @inlined
-def height_by_body(R: Mat3, X: Vec3, point: Vec3) -> Vec6:
-    """Derivative of the world z of a point that is fixed to a body at (R, X) by the body's pose."""
-    up = R.z  # in the body
-    return Vec6(cross(R.T @ (point - X), up), up)
+def position(T: Floats) -> Vec3:
+    """Position of a pose of shape (4, 4)."""
+    return Vec3(T[0, 3], T[1, 3], T[2, 3])
 
 
-def as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
-    """Rotation and position, in the layout for which compiled code exists."""
-    return np.ascontiguousarray(pose.rotation().matrix()), pose.translation()
+@inlined
+def height_by_body(T: Floats, point: Vec3) -> Vec6:
+    """Derivative of the world z of a point that is fixed to a body, by the body's pose T, shape (4, 4)."""
+    up = mat(T).z  # in the body
+    return Vec6(cross(mat(T).T @ (point - position(T)), up), up)

@@ -7,12 +7,10 @@ belong to its earliest sighting (docs/theory/identities.md).
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import compress
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats, LandmarkDetections
@@ -128,6 +126,8 @@ class Frame:
     """Rows of the detections in the journal."""
     ids: list[int]
     """Most probable identity of each detection."""
+    tracks: list[int]
+    """Track of each detection, or `NO_TRACK`."""
     refusals: list[Outcome | None]
     """Reason why that identity is not accepted; None: it is."""
     z: Floats
@@ -138,24 +138,26 @@ class Frame:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, is_in: NDArray[np.bool_]) -> "Frame | None":
+    def select(self, is_in: list[bool]) -> "Frame | None":
         """Some of the detections; None for an empty selection."""
-        if is_in.all():
+        if all(is_in):
             return self
-        if not is_in.any():
+        if not any(is_in):
             return None
+        mask = np.array(is_in)
         return replace(
             self,
-            detections=self.detections.rows(is_in),
+            detections=self.detections.rows(mask),
             rows=list(compress(self.rows, is_in)),
             ids=list(compress(self.ids, is_in)),
+            tracks=list(compress(self.tracks, is_in)),
             refusals=list(compress(self.refusals, is_in)),
-            z=self.z[is_in],
-            noise=self.noise[is_in],
+            z=self.z[mask],
+            noise=self.noise[mask],
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SeenFrame:
     """Detections of a frame, with their prediction and the keyframe to which their sightings are tied."""
 
@@ -170,13 +172,14 @@ class SeenFrame:
     """Landmarks that other detections of the frame show."""
     factors: SightingFactors
 
-    @cached_property
-    def _beams(self) -> tuple[Floats, Floats]:
-        return self.view.beams(self.frame.z)
+    def __post_init__(self) -> None:
+        self._points, height_variance = self.view.beams(self.frame.z)
+        self.floors = self._floors_under(height_variance)
+        """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
 
     def beam_points(self, rows: list[int]) -> Floats:
         """Points of the world at the measured range and azimuth and elevation 0, shape (len(rows), 3), m."""
-        return self._beams[0][rows]
+        return self._points[rows]
 
     def sightings(
         self, rows: list[int], points: Floats, elevation_rad: float = 0.0
@@ -208,19 +211,16 @@ class SeenFrame:
             for row, R in zip(rows, noise, strict=True)
         ]
 
-    @cached_property
-    def floors(self) -> list[FloorPrior | None]:
-        """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
+    def _floors_under(self, height_variance: Floats) -> list[FloorPrior | None]:
         floor = self.factors.floor
         if floor is None:
             return [None] * len(self.frame)
-        points, variance = self._beams
         # an elevation of e raises the point by e times the range along the sonar's z axis
         slope_m = self.frame.z[:, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
-        variance = variance + np.square(slope_m * self.factors.elevation_sigma_rad)
-        variance += floor.sigma_m**2
+        by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
+        variance = by_elevation + height_variance + floor.sigma_m**2
         # an object on a wall or a wreck must not be pulled to the floor
-        is_on_floor = np.square(points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
+        is_on_floor = np.square(self._points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
         return [floor if is_on else None for is_on in is_on_floor.tolist()]
 
 

@@ -177,7 +177,7 @@ class FactorStore:
         """Handle of a new group."""
         handle, self._next = self._next, self._next + 1
         self.groups[handle] = self.new[handle] = group
-        for factor in group:
+        for factor in group.factors.values():
             self.new_graph.add(factor)
         if group.seen is not None:
             # most groups are sightings: do not search the keys of their factors
@@ -259,6 +259,6 @@ def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:
     """Graph of the factors of some groups, in their order."""
     graph = gtsam.NonlinearFactorGraph()
     for group in groups:
-        for factor in group:
+        for factor in group.factors.values():
             graph.add(factor)
     return graph

@@ -125,7 +125,7 @@ def factors_of(part: Groups) -> list[gtsam.NonlinearFactor]:
     groups = list(part.values())
     seen = groups[0].seen
     if len(groups) == 1 or seen is None:
-        return list(groups[0])
+        return list(groups[0].factors.values())
     landmark_key, line = seen
     error = BundleError((line.pose_key, landmark_key), groups)
     noise = gtsam.noiseModel.Unit.Create(error.rows)
