@@ -6,7 +6,7 @@ factors, or bias where they have none; marginals contain its information then.
 """
 
 from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -144,13 +144,34 @@ Sightlines = Mapping[int, Sequence[Sightline]]
 """Sightings that have become factors, by landmark's key."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
 class FactorGroup:
-    """Factors that are used together or not at all, such as those of one sighting."""
+    """Factors that are used together or not at all, such as those of one sighting.
 
-    factors: Factors
-    seen: tuple[int, Sightline] | None = None
-    """Of a sighting: the key of its landmark, and where that was seen from."""
+    Parameters
+    ----------
+    factors
+        The factors, or a function that makes them, which is called when they are first needed: to make the factors of
+        many sightings in a row, at an update, is faster than to make those of each frame.
+    seen
+        Of a sighting: the key of its landmark, and where that was seen from.
+    """
+
+    __slots__ = ("_factors", "seen")
+
+    def __init__(
+        self,
+        factors: Factors | Callable[[], Factors],
+        seen: tuple[int, Sightline] | None = None,
+    ) -> None:
+        self._factors = factors
+        self.seen = seen
+
+    @property
+    def factors(self) -> Factors:
+        """Factors by their labels."""
+        if not isinstance(self._factors, dict):
+            self._factors = self._factors()
+        return self._factors
 
     def __iter__(self) -> Iterator[gtsam.NonlinearFactor]:
         return iter(self.factors.values())
@@ -162,8 +183,7 @@ class FactorStore:
     def __init__(self) -> None:
         self.new: dict[int, FactorGroup] = {}
         """Groups that the window has not taken up yet, by handle."""
-        self.new_graph = gtsam.NonlinearFactorGraph()
-        """Their factors."""
+        self._new_graph: gtsam.NonlinearFactorGraph | None = None
         self.gone: set[gtsam.NonlinearFactor] = set()
         """Factors that were taken out since the window took up the others."""
         self.groups: dict[int, FactorGroup] = {}
@@ -177,8 +197,7 @@ class FactorStore:
         """Handle of a new group."""
         handle, self._next = self._next, self._next + 1
         self.groups[handle] = self.new[handle] = group
-        for factor in group.factors.values():
-            self.new_graph.add(factor)
+        self._new_graph = None
         if group.seen is not None:
             # most groups are sightings: do not search the keys of their factors
             landmark_key, line = group.seen
@@ -194,6 +213,13 @@ class FactorStore:
             self._leaving_with[min(lasting)].append(handle)
         return handle
 
+    @property
+    def new_graph(self) -> gtsam.NonlinearFactorGraph:
+        """Factors of the new groups."""
+        if self._new_graph is None:
+            self._new_graph = graph_of(self.new.values())
+        return self._new_graph
+
     def remove(self, handles: Iterable[int]) -> None:
         """Take groups out."""
         for handle in handles:
@@ -201,8 +227,7 @@ class FactorStore:
             group = self.groups.pop(handle)
             self.gone.update(group)
             self._drop_line(handle, group)
-        # GTSAM's graph would keep a hole
-        self.new_graph = graph_of(self.new.values())
+        self._new_graph = None
 
     def leave(self, keys: Iterable[int]) -> list[int]:
         """Drop the groups that leave with these variables; their handles."""
@@ -221,7 +246,9 @@ class FactorStore:
 
     def take_up(self) -> None:
         """The window has taken up what was new, and let go of what is gone."""
-        self.new, self.gone, self.new_graph = {}, set(), gtsam.NonlinearFactorGraph()
+        self.new = {}
+        self.gone = set()
+        self._new_graph = None
 
     def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
         """Factors of some groups."""

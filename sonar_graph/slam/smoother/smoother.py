@@ -34,7 +34,6 @@ from sonar_graph.slam.smoother.factor_store import (
     FactorGroup,
     Factors,
     FactorStore,
-    Sightline,
     is_pose,
     picked,
     variable_name,
@@ -350,22 +349,23 @@ class Smoother:
 
     def add(
         self,
-        factors: Factors,
-        seen: tuple[int, Sightline] | None = None,
+        factors: Factors | FactorGroup,
         *,
         gain: float = 0.0,
     ) -> int:
-        """Add factors that are used together or not at all (`FactorGroup`), at the next update; returns their handle.
+        """Add factors that are used together or not at all, at the next update; returns their handle.
 
         ``gain``: expected information, predicted variance over noise variance.
         """
+        group = factors if isinstance(factors, FactorGroup) else FactorGroup(factors)
         self._waiting_gain += gain
         # the batch solution lacks these factors
         self._solved = None
-        if seen is not None:
+        if group.seen is not None:
             # stands for the range of the sonar, which the calibration does not contain
-            self._longest_range_m = max(self._longest_range_m, float(seen[1].z[0]))
-        return self._store.add(FactorGroup(factors, seen))
+            range_m = float(group.seen[1].z[0])
+            self._longest_range_m = max(self._longest_range_m, range_m)
+        return self._store.add(group)
 
     def hold(self, until_s: dict[int, float]) -> None:
         """Keep these keyframes, and all later ones, in a bounded window until the given times."""
@@ -417,7 +417,7 @@ class Smoother:
         self._forget(lost_landmarks)
         for key, point in (new_landmarks or {}).items():
             self.add_landmark(key, point)
-        handles = [self.add(group.factors, group.seen) for group in added]
+        handles = [self.add(group) for group in added]
         self._withhold_unusable()
         if lost_landmarks and self.is_bounded:
             # GTSAM's fixed-lag smoother keeps a variable that lost its factors: begin again without it
