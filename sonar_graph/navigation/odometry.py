@@ -269,7 +269,9 @@ class Odometry:
         """What the walk of the velocity in closed gaps adds to the displacement over each interval, shape (n,)."""
         first = max(int(self._dvl.stamps_ns.searchsorted(start_ns[0])) - 1, 0)
         dvl_ns = self._dvl.stamps_ns[first:]
-        is_gap = np.diff(dvl_ns) > self._sensors.longest_ns
+        is_gap = dvl_ns[1:] - dvl_ns[:-1] > self._sensors.longest_ns
+        if not is_gap.any():
+            return np.zeros(len(start_ns))
         found_ns = dvl_ns[1:][is_gap]
         gap_s = (found_ns - dvl_ns[:-1][is_gap]) * 1e-9  # (g,)
         # from both ends of each interval to the end of each gap, (n, g)
@@ -410,9 +412,10 @@ class Odometry:
             for k in is_gap.nonzero()[0].tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
-                before = stretch.continued(
-                    rows, sensors, removed, lost_ns, known_ns
-                ).motion
+                (until_lost,) = stretch.continued(
+                    rows, sensors, removed, [lost_ns], known_ns
+                )
+                before = until_lost.motion
                 over_gap = closed_bridge(
                     rows.known(known_ns),
                     sensors,
@@ -421,18 +424,21 @@ class Odometry:
                     found_ns,
                 )
                 stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
-            stretch = stretch.continued(rows, sensors, removed, newest_ns, known_ns)
-        self._kept = Kept(key, stretch)
-
         # from the newest epoch on: provisional, and not kept
-        if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
-            before = stretch.motion
+        is_open = bool(len(epochs_ns)) and self.is_gap(newest_ns, end_ns)
+        ends_ns = [newest_ns] if is_open else [newest_ns, end_ns]
+        until_newest, *until_end = stretch.continued(
+            rows, sensors, removed, ends_ns, known_ns
+        )
+        self._kept = Kept(key, until_newest)
+        if is_open:
+            before = until_newest.motion
             here = removed.after(before)
             since_lost = open_bridge(
                 rows.known(known_ns), sensors, here, newest_ns, end_ns
             )
             return before.then(since_lost)
-        return stretch.continued(rows, sensors, removed, end_ns, known_ns).motion
+        return until_end[0].motion
 
 
 @compiled

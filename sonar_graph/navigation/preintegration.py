@@ -189,16 +189,24 @@ START = no_steps(1)
 
 
 def add_to(
-    sums: Floats, rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
+    sums: Floats,
+    rows: Rows,
+    intervals: Intervals,
+    sensors: Sensors,
+    removed: Removed,
+    *,
+    are_chained: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Add the steps of intervals to their sums, shape (n, 20, 3); returns covariances and derivatives by the bias."""
+    """Add the steps of intervals to their sums, shape (n, 20, 3); returns covariances and derivatives by the bias.
+
+    ``are_chained``: each interval continues the sums of the one before it.
+    """
     n = len(sums)
     C = np.empty((n, 6, 6))
     D = np.empty((n, 6, 3))
     constants = (sensors.body_p_dvl, *removed)
-    add_steps(
-        rows, intervals, sensors.gyro_density, constants, (sums.reshape(-1, 3), C, D)
-    )
+    found = (sums.reshape(-1, 3), C, D)
+    add_steps(rows, intervals, sensors.gyro_density, constants, found, are_chained)
     return C, D
 
 
@@ -245,26 +253,37 @@ class Stretch(NamedTuple):
         rows: Rows,
         sensors: Sensors,
         removed: Removed,
-        end_ns: int,
+        ends_ns: list[int],
         known_ns: int = LATEST_NS,
-    ) -> Stretch:
-        """The stretch until a later instant, by rows that are known at an instant.
+    ) -> list[Stretch]:
+        """The stretch until each of later instants, in order, by rows that are known at an instant.
 
         Velocities are linear or held however far apart the samples are: gaps are for the caller to find.
         """
-        if end_ns == self.until_ns:
-            return self
+        n = len(ends_ns)
         intervals = Intervals(
-            np.array([self.until_ns]),
-            np.array([end_ns]),
-            np.array([known_ns]),
+            np.array([self.until_ns, *ends_ns[:-1]]),
+            np.array(ends_ns),
+            np.array([known_ns] * n),
             LATEST_NS,
         )
-        sums = self.sums.copy()
+        sums = np.empty((n, SIZE, 3))
+        sums[0] = self.sums[0]
         # the Earth's rotation is known in the frame where the motion begins
         here = removed.after(self.before)
-        C, D = add_to(sums, rows, intervals, sensors, here)
-        return Stretch(self.start_ns, end_ns, self.bias, self.before, sums, C[0], D[0])
+        C, D = add_to(sums, rows, intervals, sensors, here, are_chained=True)
+        return [
+            Stretch(
+                self.start_ns,
+                end_ns,
+                self.bias,
+                self.before,
+                sums[k : k + 1],
+                C[k],
+                D[k],
+            )
+            for k, end_ns in enumerate(ends_ns)
+        ]
 
     @property
     def motion(self) -> PreintegratedMotion:
@@ -284,7 +303,7 @@ def motion_over(
     """Motion between two instants by linear or held velocities, however far apart the samples are."""
     return (
         Stretch.begin(start_ns, removed.bias)
-        .continued(rows, sensors, removed, end_ns)
+        .continued(rows, sensors, removed, [end_ns])[0]
         .motion
     )
 
@@ -325,6 +344,7 @@ def add_steps(
     gyro_density: float,
     constants: tuple[Floats, Floats, Floats],
     found: tuple[Floats, Floats, Floats],
+    are_chained: bool,
 ) -> None:
     """Add steps to the sums of n intervals, shape (20 n, 3), and fill in C, shape (n, 6, 6), and D, (n, 6, 3).
 
@@ -346,14 +366,15 @@ def add_steps(
         imu_rows = rows_until(rows.imu_ns, known)
         dvl_rows = max(rows_until(rows.known_ns, known), 1)
         at = SIZE * e
-        R = mat(sums, (at, 0))
-        p = row_of(sums, at + P)
-        impulse = row_of(sums, at + IMPULSE)
-        tt = mat(sums, (at + TT, 0))
-        rt = mat(sums, (at + RT, 0))
-        rr = mat(sums, (at + RR, 0))
-        D_t = mat(sums, (at + D_T, 0))
-        D_r = mat(sums, (at + D_R, 0))
+        since = at - SIZE if are_chained and e > 0 else at
+        R = mat(sums, (since, 0))
+        p = row_of(sums, since + P)
+        impulse = row_of(sums, since + IMPULSE)
+        tt = mat(sums, (since + TT, 0))
+        rt = mat(sums, (since + RT, 0))
+        rr = mat(sums, (since + RR, 0))
+        D_t = mat(sums, (since + D_T, 0))
+        D_r = mat(sums, (since + D_R, 0))
         # NaN marks the interval for the caller, who bridges the gap
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, intervals.longest_ns):
             t = end

@@ -116,15 +116,14 @@ class SonarViews(NamedTuple):
 
 def sighted_from(values: Known, lines: Sequence[Sightline]) -> SonarViews:
     """Sightings from where keyframes are estimated."""
-    R = np.empty((len(lines), 3, 3))
-    t = np.empty((len(lines), 3))
-    z = np.empty((len(lines), 2))
-    for k, line in enumerate(lines):
-        world_T_sonar = values.atPose3(line.pose_key).compose(line.body_T_sonar)
-        R[k] = world_T_sonar.rotation().matrix()
-        t[k] = world_T_sonar.translation()
-        z[k] = line.z
-    return SonarViews(R, t, z)
+    world_T_sonar = np.array(
+        [
+            values.atPose3(line.pose_key).compose(line.body_T_sonar).matrix()
+            for line in lines
+        ]
+    ).reshape(-1, 4, 4)
+    z = np.array([line.z for line in lines]).reshape(-1, 2)
+    return SonarViews(world_T_sonar[:, :3, :3], world_T_sonar[:, :3, 3], z)
 
 
 def missed(sighted: SonarViews, landmark: Floats) -> tuple[int, Floats]:

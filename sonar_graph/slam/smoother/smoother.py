@@ -725,11 +725,12 @@ class Smoother:
             return []
         reach_m = REACH * self._longest_range_m
         new = self.estimates.new
+        new_keys = set(new.keys())
         # within the relinearisation threshold of the estimate, and known without back-substitution
         linearised_at = self._window.linearised_at
         position_m = self.estimates.atPose3(self._newest_pose).translation()
         points_m = [
-            (new if new.exists(key) else linearised_at).atPoint3(key)
+            (new if key in new_keys else linearised_at).atPoint3(key)
             for key in self._landmarks
         ]
         d = np.array(points_m) - position_m

@@ -186,9 +186,10 @@ class WholeWindow:
         params.force_relinearize = relinearises
         groups = gtsam.KeyGroupMap()
         eliminated_again = gtsam.KeyList()
+        new_keys = set(values.keys())
         for key in last:
             groups.insert2(key, LAST)
-            if not values.exists(key):
+            if key not in new_keys:
                 # GTSAM orders only what it eliminates
                 eliminated_again.push_back(key)
         params.constrainedKeys = groups
