@@ -58,6 +58,15 @@ from sonar_graph.states import RefusedRow
 ZERO = np.zeros(3)
 
 
+class Known(NamedTuple):
+    """What a motion may use."""
+
+    at_ns: int
+    """Only rows that are known at this instant."""
+    epochs_ns: Ints
+    """Epochs that are reached at it, up to the end of the motion, shape (n,)."""
+
+
 class Kept(NamedTuple):
     """Part of a motion that is final, kept for the next call with the same start, bias and Earth's rotation."""
 
@@ -234,17 +243,17 @@ class Odometry:
             else world_R_i.T @ self._earth
         )
         removed = Removed(bias, earth)
-        lost_ns = self._newest_epoch(end_ns, known_ns)
-        if (
-            lost_ns is not None
-            and lost_ns < start_ns < end_ns
-            and self.is_gap(lost_ns, end_ns)
-        ):
+        # the IMU row that covers an epoch may come after the epoch's own stamp
+        epochs_ns = self.epochs(EARLIEST_NS, known_ns)
+        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
+        known = Known(known_ns, epochs_ns)
+        lost_ns = int(epochs_ns[-1]) if len(epochs_ns) else end_ns
+        if lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
             # both instants lie in one open gap
-            before = self._motion_since(lost_ns, start_ns, known_ns, removed)
-            whole = self._motion_since(lost_ns, end_ns, known_ns, removed)
+            before = self._motion_since(lost_ns, start_ns, known, removed)
+            whole = self._motion_since(lost_ns, end_ns, known, removed)
             return remaining_motion(before, whole)
-        return self._motion_since(start_ns, end_ns, known_ns, removed)
+        return self._motion_since(start_ns, end_ns, known, removed)
 
     def motions(
         self,
@@ -342,13 +351,6 @@ class Odometry:
             self._dvl.values[2],
         )
 
-    def _newest_epoch(self, until_ns: int, known_ns: int) -> int | None:
-        """The newest epoch up to an instant that is reached at another; None before the first."""
-        # the IMU row that covers an epoch may come after the epoch's own stamp
-        epochs_ns = self.epochs(EARLIEST_NS, known_ns)
-        last = int(epochs_ns.searchsorted(until_ns, side="right"))
-        return int(epochs_ns[last - 1]) if last > 0 else None
-
     def _lies_in_gap(self, instant_ns: int) -> bool:
         """True where an instant lies between the two epochs of a closed gap."""
         k = int(self._dvl.stamps_ns.searchsorted(instant_ns))
@@ -382,7 +384,7 @@ class Odometry:
             )
 
     def _motion_since(
-        self, start_ns: int, end_ns: int, known_ns: int, removed: Removed
+        self, start_ns: int, end_ns: int, known: Known, removed: Removed
     ) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 
@@ -390,8 +392,8 @@ class Odometry:
         """
         rows = self.rows()
         sensors = self._sensors
-        epochs_ns = self.epochs(start_ns - 1, known_ns)
-        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
+        known_ns, epochs_ns = known
+        epochs_ns = epochs_ns[epochs_ns.searchsorted(start_ns) :]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
         key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
         kept = self._kept

@@ -585,7 +585,8 @@ class Keyframes:
         up_j = self.smoother.estimates.atPose3(X(j)).rotation().matrix()[2]
         # only the part of the odometry's error along the vertical moves a depth
         ups = carried.k_R_j[1:] @ up_j  # (n, 3)
-        wander_m2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, 3:, 3:], ups)
+        of_ups = carried.C[:, 3:, 3:] @ ups[:, :, None]  # (n, 3, 1)
+        wander_m2 = np.vecdot(ups, of_ups[:, :, 0])
         z_m = depth.z_m
         given_m2 = depth.variance_m2
         variance_m2 = np.where(
@@ -593,7 +594,7 @@ class Keyframes:
         )
         average = average_at_end(variance_m2, wander_m2)
         port = np.array(self.calibration.depth.port_m)
-        ports = np.einsum("kba,kb->ka", carried.k_R_j[:-1], port - carried.k_p_j[:-1])
+        ports = ((port - carried.k_p_j[:-1])[:, None] @ carried.k_R_j[:-1])[:, 0]
         height_m = float(average.weights @ z_m)
         sigma_m = average.variance**0.5
         self.smoother.add(
