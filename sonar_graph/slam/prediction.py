@@ -101,8 +101,7 @@ class AnchoredPose:
             else motion.corrected(values.atVector(bias_key))
         )
         rows = joint.first_rows(self.tie.keys)
-        cov = np.empty((6, 6))
-        write_carried(self.tie.moved(i_T_j), joint.matrix, rows, cov)
+        cov = carried_covariance(self.tie.moved(i_T_j), joint.matrix, rows)
         return Estimate(self.stamp_ns, values.atPose3(pose_key).compose(i_T_j), cov)
 
 
@@ -284,11 +283,8 @@ class PredictedView:
             located = np.arange(len(P), len(P) + 3 * len(sources), 3)
             rows = np.concatenate((rows, located))
             P = with_sources(joint, sources)
-        expected = np.empty((len(points), 2))
-        S_0 = np.empty((2 * len(points), 2 * len(points)))
         moved = self._tie.moved(self._tie.motion.i_T_j)
-        write_expected(self._sonar, moved, P, rows, points, (expected, S_0))
-        return expected, S_0
+        return expected_views(self._sonar, moved, P, rows, points)
 
     def compare(
         self, keys: list[int], points: Floats, z: Floats, cov: Floats
@@ -368,7 +364,10 @@ def by_state(moved: Moved) -> Floats:
     store(R_inverse, J, UPPER_LEFT)  # Ad(M^-1)
     store(-1.0 * (R_inverse @ skew(position(i_T_j))), J, LOWER_LEFT)
     store(R_inverse, J, LOWER_RIGHT)
-    J[:, 6:] = D
+    # assigning to a slice would take seconds to compile
+    for i in range(6):
+        for k in range(D.shape[1]):
+            J[i, 6 + k] = D[i, k]
     return J
 
 
@@ -394,31 +393,26 @@ def joint_of(P: Floats, rows: Ints, biases: int) -> Floats:
 
 
 @compiled
-def write_carried(moved: Moved, P: Floats, rows: Ints, found: Floats) -> None:
-    """Fill in (1), shape (6, 6); P and rows are those of `joint_of`."""
+def carried_covariance(moved: Moved, P: Floats, rows: Ints) -> Floats:
+    """(1), shape (6, 6); P and rows are those of `joint_of`."""
     J = by_state(moved)
     _, D, Q = moved
     _, JPJ_Q = innovation_of(joint_of(P, rows, D.shape[1]), J, Q)
-    found[:] = JPJ_Q
+    return JPJ_Q
 
 
 @compiled
-def write_expected(
-    sonar: SonarOnBody,
-    moved: Moved,
-    P: Floats,
-    rows: Ints,
-    points: Floats,
-    found: tuple[Floats, Floats],
-) -> None:
-    """Fill in range and azimuth of m points, shape (m, 2), after a motion, and their joint covariance (2), (2 m, 2 m).
+def expected_views(
+    sonar: SonarOnBody, moved: Moved, P: Floats, rows: Ints, points: Floats
+) -> tuple[Floats, Floats]:
+    """Range and azimuth of m points, shape (m, 2), after a motion, and their joint covariance (2), shape (2 m, 2 m).
 
     P and rows are those of `joint_of`.
     """
     world_T_body, body_T_sonar = sonar
     _, D, Q = moved
-    expected, S_0 = found
     m = len(points)
+    expected = np.empty((m, 2))
     mount = Mount(body_T_sonar, body_T_sonar[:3, 3])
     J = by_state(moved)
     n = J.shape[1]
@@ -438,8 +432,8 @@ def write_expected(
             for c in range(n):
                 H[r, c] += H_M[r, i] * J[i, c]  # H_M J
     _, HQH = innovation_of(Q, H_M, np.zeros((2 * m, 2 * m)))
-    _, HPH_HQH = innovation_of(joint_of(P, rows, D.shape[1]), H, HQH)
-    S_0[:] = HPH_HQH
+    _, S_0 = innovation_of(joint_of(P, rows, D.shape[1]), H, HQH)
+    return expected, S_0
 
 
 @compiled
