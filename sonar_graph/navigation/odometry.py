@@ -58,7 +58,7 @@ from sonar_graph.states import RefusedRow
 ZERO = np.zeros(3)
 
 
-class Known(NamedTuple):
+class KnownEpochs(NamedTuple):
     """What a motion may use."""
 
     at_ns: int
@@ -246,7 +246,7 @@ class Odometry:
         # the IMU row that covers an epoch may come after the epoch's own stamp
         epochs_ns = self.epochs(EARLIEST_NS, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
-        known = Known(known_ns, epochs_ns)
+        known = KnownEpochs(known_ns, epochs_ns)
         lost_ns = int(epochs_ns[-1]) if len(epochs_ns) else end_ns
         if lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
             # both instants lie in one open gap
@@ -384,7 +384,7 @@ class Odometry:
             )
 
     def _motion_since(
-        self, start_ns: int, end_ns: int, known: Known, removed: Removed
+        self, start_ns: int, end_ns: int, known: KnownEpochs, removed: Removed
     ) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 

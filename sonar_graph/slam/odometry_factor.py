@@ -93,7 +93,7 @@ class OdometryError:
         self._poses = np.empty((2, 1, 12))
         self._R = self._poses[:, 0, :9].reshape(2, 3, 3)
         self._p = self._poses[:, 0, 9:]
-        self._result = Linear.empty(1, len(self.h))
+        self._result = OdometryDerivatives.empty(1, len(self.h))
 
     def __call__(
         self,
@@ -111,7 +111,7 @@ class OdometryError:
         if jacobians is None:
             return odometry_errors(X_i, X_j, change, self._motion)[0]
         found = self._result
-        write_derivatives(X_i, X_j, change, self._motion, tuple(found))
+        write_derivatives(X_i, X_j, change, self._motion, (*found,))
         jacobians[0] = found.by_i[0].T  # back to rows
         jacobians[1] = found.by_j[0].T
         jacobians[2] = found.by_b[0].T
@@ -147,7 +147,7 @@ BiasedMotions = tuple[Floats, Floats, Floats, Floats]
 shape (n, 6, 6)."""
 
 
-class Linear(NamedTuple):
+class OdometryDerivatives(NamedTuple):
     """Errors of n motions, and their derivatives, transposed."""
 
     errors: Floats
@@ -160,7 +160,7 @@ class Linear(NamedTuple):
     """By b, shape (n, 11, 6)."""
 
     @classmethod
-    def empty(cls, n: int, biases: int) -> Linear:
+    def empty(cls, n: int, biases: int) -> OdometryDerivatives:
         """Arrays to be filled."""
         return cls(
             np.empty((n, 6)),
@@ -197,8 +197,8 @@ class OdometryStack:
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised."""
-        found = Linear.empty(*self._motions[2].shape)
-        write_derivatives(*self._states(values), self._motions, tuple(found))
+        found = OdometryDerivatives.empty(*self._motions[2].shape)
+        write_derivatives(*self._states(values), self._motions, (*found,))
         e, *columns = found
         # stored by columns, as GTSAM stores them
         blocks = (transposed.transpose(0, 2, 1) for transposed in columns)
@@ -240,11 +240,11 @@ def write_derivatives(
     X_j: Floats,
     changes: Floats,
     motions: BiasedMotions,
-    found: tuple[Floats, Floats, Floats, Floats],
+    linear: tuple[Floats, Floats, Floats, Floats],
 ) -> None:
-    """As `odometry_errors`; fills the arrays of `Linear`."""
+    """As `odometry_errors`; fills the arrays of `OdometryDerivatives`."""
     i_T_j, D, h, whitening = motions
-    errors, by_i, by_j, by_b = found
+    errors, by_i, by_j, by_b = linear
     n, biases = changes.shape
     for k in range(n):
         found = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])

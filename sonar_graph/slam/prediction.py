@@ -323,7 +323,7 @@ def weigh(z: Floats, expected: Floats, joint: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its joint covariance, shape (2 m, 2 m)."""
     m = len(z)
     found = Compared(np.empty((m, 2)), np.empty((m, 2, 2)), np.empty(m), np.empty(m))
-    write_compared(z, expected, joint, cov, tuple(found))
+    write_compared(z, expected, joint, cov, (*found,))
     return found
 
 
