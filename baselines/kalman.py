@@ -32,27 +32,6 @@ class Judged(NamedTuple):
 
 
 @compilable
-def innovation_of(P: Floats, H: Floats, R: Floats) -> tuple[Floats, Floats]:
-    """``H P``, shape (m, n), and ``S = H P H^T + R``, shape (m, m), symmetric to the last bit."""
-    m, n = H.shape
-    HP = np.zeros((m, n))
-    S = R.copy()
-    for r in range(m):
-        for k in range(n):
-            # most numbers of a Jacobian are zero: a detection has nine others in each row
-            if H[r, k] != 0.0:
-                for j in range(n):
-                    HP[r, j] += H[r, k] * P[k, j]
-        for i in range(r + 1):
-            HPH = 0.0
-            for k in range(n):
-                HPH += H[i, k] * HP[r, k]
-            S[r, i] += HPH
-            S[i, r] = S[r, i]
-    return HP, S
-
-
-@compilable
 def cholesky(S: Floats) -> Floats:
     """Lower triangle L with ``S = L L^T``; NaN on its diagonal where S is not positive definite.
 

@@ -144,7 +144,11 @@ class Block:
             and len(self.stamps_ns[selection])
         ):
             # as the whole is
-            return self.of_valid(*(column[selection] for column in vars(self).values()))
+            block = object.__new__(type(self))
+            vars(block).update(
+                {name: column[selection] for name, column in vars(self).items()}
+            )
+            return block
         return type(self)(
             *(getattr(self, column.name)[selection] for column in fields(self))
         )
@@ -434,17 +438,16 @@ class LandmarkDetections(Block):
         # determinant and symmetry relative to the diagonal: metres and radians differ
         a, b, c, d = self.range_azimuth_cov.reshape(-1, 4).T
         with np.errstate(all="ignore"):
-            is_definite = (
+            ad = a * d
+            is_sound = (
                 (a > 0)
-                & (a * d - b * c > ROUNDING * a * d)
-                & (np.abs(b - c) <= ROUNDING * np.sqrt(a * d))
+                & (ad - b * c > ROUNDING * ad)
+                & (np.abs(b - c) <= ROUNDING * np.sqrt(ad))
             )
-        is_possible = possible_ranges(self.range_m) & (
-            np.abs(self.azimuth_rad) <= FULL_TURN_RAD
-        )
-        return is_possible & (
-            is_definite | np.isnan(a) | np.isnan(b) | np.isnan(c) | np.isnan(d)
-        )
+        if not is_sound.all():
+            is_sound |= np.isnan(self.range_azimuth_cov).any(axis=(1, 2))
+        is_sound &= possible_ranges(self.range_m)
+        return is_sound & (np.abs(self.azimuth_rad) <= FULL_TURN_RAD)
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""

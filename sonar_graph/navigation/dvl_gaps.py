@@ -53,7 +53,6 @@ from sonar_graph.navigation.preintegration import (
     Rows,
     Sensors,
     motion_over,
-    row_of,
     rows_until,
     value_at,
 )
@@ -68,6 +67,7 @@ from sonar_graph.numerics import (
     exp_and_mean,
     mat,
     outer,
+    row_of,
     skew,
     store,
     vec,

@@ -58,6 +58,15 @@ from sonar_graph.states import RefusedRow
 ZERO = np.zeros(3)
 
 
+class KnownEpochs(NamedTuple):
+    """What a motion may use."""
+
+    at_ns: int
+    """Only rows that are known at this instant."""
+    epochs_ns: Ints
+    """Epochs that are reached at it, up to the end of the motion, shape (n,)."""
+
+
 class Kept(NamedTuple):
     """Part of a motion that is final, kept for the next call with the same start, bias and Earth's rotation."""
 
@@ -234,17 +243,17 @@ class Odometry:
             else world_R_i.T @ self._earth
         )
         removed = Removed(bias, earth)
-        lost_ns = self._newest_epoch(end_ns, known_ns)
-        if (
-            lost_ns is not None
-            and lost_ns < start_ns < end_ns
-            and self.is_gap(lost_ns, end_ns)
-        ):
+        # the IMU row that covers an epoch may come after the epoch's own stamp
+        epochs_ns = self.epochs(EARLIEST_NS, known_ns)
+        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
+        known = KnownEpochs(known_ns, epochs_ns)
+        lost_ns = int(epochs_ns[-1]) if len(epochs_ns) else end_ns
+        if lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
             # both instants lie in one open gap
-            before = self._motion_since(lost_ns, start_ns, known_ns, removed)
-            whole = self._motion_since(lost_ns, end_ns, known_ns, removed)
+            before = self._motion_since(lost_ns, start_ns, known, removed)
+            whole = self._motion_since(lost_ns, end_ns, known, removed)
             return remaining_motion(before, whole)
-        return self._motion_since(start_ns, end_ns, known_ns, removed)
+        return self._motion_since(start_ns, end_ns, known, removed)
 
     def motions(
         self,
@@ -269,7 +278,9 @@ class Odometry:
         """What the walk of the velocity in closed gaps adds to the displacement over each interval, shape (n,)."""
         first = max(int(self._dvl.stamps_ns.searchsorted(start_ns[0])) - 1, 0)
         dvl_ns = self._dvl.stamps_ns[first:]
-        is_gap = np.diff(dvl_ns) > self._sensors.longest_ns
+        is_gap = dvl_ns[1:] - dvl_ns[:-1] > self._sensors.longest_ns
+        if not is_gap.any():
+            return np.zeros(len(start_ns))
         found_ns = dvl_ns[1:][is_gap]
         gap_s = (found_ns - dvl_ns[:-1][is_gap]) * 1e-9  # (g,)
         # from both ends of each interval to the end of each gap, (n, g)
@@ -340,13 +351,6 @@ class Odometry:
             self._dvl.values[2],
         )
 
-    def _newest_epoch(self, until_ns: int, known_ns: int) -> int | None:
-        """The newest epoch up to an instant that is reached at another; None before the first."""
-        # the IMU row that covers an epoch may come after the epoch's own stamp
-        epochs_ns = self.epochs(EARLIEST_NS, known_ns)
-        last = int(epochs_ns.searchsorted(until_ns, side="right"))
-        return int(epochs_ns[last - 1]) if last > 0 else None
-
     def _lies_in_gap(self, instant_ns: int) -> bool:
         """True where an instant lies between the two epochs of a closed gap."""
         k = int(self._dvl.stamps_ns.searchsorted(instant_ns))
@@ -365,7 +369,7 @@ class Odometry:
                 "motion: needs rows of IMU and Doppler log; add them first"
             )
         for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
-            if not isinstance(instant, int | np.integer):
+            if not isinstance(instant, (int, np.integer)):
                 raise MeasurementError(
                     f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row"
                 )
@@ -380,7 +384,7 @@ class Odometry:
             )
 
     def _motion_since(
-        self, start_ns: int, end_ns: int, known_ns: int, removed: Removed
+        self, start_ns: int, end_ns: int, known: KnownEpochs, removed: Removed
     ) -> PreintegratedMotion:
         """Motion from an instant: final to the newest epoch, provisional from there on.
 
@@ -388,14 +392,15 @@ class Odometry:
         """
         rows = self.rows()
         sensors = self._sensors
-        epochs_ns = self.epochs(start_ns - 1, known_ns)
-        epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
+        known_ns, epochs_ns = known
+        epochs_ns = epochs_ns[epochs_ns.searchsorted(start_ns) :]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
-        stretch = Stretch.begin(start_ns, removed.bias)
         key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
         kept = self._kept
         if kept is not None and kept.key == key and kept.stretch.until_ns <= newest_ns:
             stretch = kept.stretch
+        else:
+            stretch = Stretch.begin(start_ns, removed.bias)
 
         if stretch.until_ns < newest_ns:
             new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
@@ -405,12 +410,14 @@ class Odometry:
                     rows.known(known_ns), sensors, removed, start_ns, found_ns
                 )
                 stretch = Stretch.begin(found_ns, removed.bias, over_gap)
-            for k in np.flatnonzero(np.diff(new_ns) > sensors.longest_ns).tolist():
+            is_gap = new_ns[1:] - new_ns[:-1] > sensors.longest_ns
+            for k in is_gap.nonzero()[0].tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
-                before = stretch.continued(
-                    rows, sensors, removed, lost_ns, known_ns
-                ).motion
+                (until_lost,) = stretch.continued(
+                    rows, sensors, removed, [lost_ns], known_ns
+                )
+                before = until_lost.motion
                 over_gap = closed_bridge(
                     rows.known(known_ns),
                     sensors,
@@ -419,18 +426,21 @@ class Odometry:
                     found_ns,
                 )
                 stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
-            stretch = stretch.continued(rows, sensors, removed, newest_ns, known_ns)
-        self._kept = Kept(key, stretch)
-
         # from the newest epoch on: provisional, and not kept
-        if len(epochs_ns) and self.is_gap(newest_ns, end_ns):
-            before = stretch.motion
+        is_open = bool(len(epochs_ns)) and self.is_gap(newest_ns, end_ns)
+        ends_ns = [newest_ns] if is_open else [newest_ns, end_ns]
+        until_newest, *until_end = stretch.continued(
+            rows, sensors, removed, ends_ns, known_ns
+        )
+        self._kept = Kept(key, until_newest)
+        if is_open:
+            before = until_newest.motion
             here = removed.after(before)
             since_lost = open_bridge(
                 rows.known(known_ns), sensors, here, newest_ns, end_ns
             )
             return before.then(since_lost)
-        return stretch.continued(rows, sensors, removed, end_ns, known_ns).motion
+        return until_end[0].motion
 
 
 @compiled

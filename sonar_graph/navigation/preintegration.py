@@ -53,6 +53,7 @@ from sonar_graph.numerics import (
     exp_and_mean,
     inlined,
     mat,
+    row_of,
     skew,
     store,
     store6,
@@ -188,17 +189,25 @@ START = no_steps(1)
 
 
 def add_to(
-    sums: Floats, rows: Rows, intervals: Intervals, sensors: Sensors, removed: Removed
+    sums: Floats,
+    rows: Rows,
+    intervals: Intervals,
+    sensors: Sensors,
+    removed: Removed,
+    *,
+    are_chained: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Add the steps of intervals to their sums, shape (n, 20, 3); returns covariances and derivatives by the bias."""
-    return add_steps(
-        rows,
-        intervals,
-        sensors.gyro_density,
-        sensors.body_p_dvl,
-        *removed,
-        sums.reshape(-1, 3),
-    )
+    """Add the steps of intervals to their sums, shape (n, 20, 3); returns covariances and derivatives by the bias.
+
+    ``are_chained``: each interval continues the sums of the one before it.
+    """
+    n = len(sums)
+    C = np.empty((n, 6, 6))
+    D = np.empty((n, 6, 3))
+    constants = (sensors.body_p_dvl, *removed)
+    found = (sums.reshape(-1, 3), C, D)
+    add_steps(rows, intervals, sensors.gyro_density, constants, found, are_chained)
+    return C, D
 
 
 def motions_over(
@@ -244,26 +253,37 @@ class Stretch(NamedTuple):
         rows: Rows,
         sensors: Sensors,
         removed: Removed,
-        end_ns: int,
+        ends_ns: list[int],
         known_ns: int = LATEST_NS,
-    ) -> Stretch:
-        """The stretch until a later instant, by rows that are known at an instant.
+    ) -> list[Stretch]:
+        """The stretch until each of later instants, in order, by rows that are known at an instant.
 
         Velocities are linear or held however far apart the samples are: gaps are for the caller to find.
         """
-        if end_ns == self.until_ns:
-            return self
+        n = len(ends_ns)
         intervals = Intervals(
-            np.array([self.until_ns]),
-            np.array([end_ns]),
-            np.array([known_ns]),
+            np.array([self.until_ns, *ends_ns[:-1]]),
+            np.array(ends_ns),
+            np.array([known_ns] * n),
             LATEST_NS,
         )
-        sums = self.sums.copy()
+        sums = np.empty((n, SIZE, 3))
+        sums[0] = self.sums[0]
         # the Earth's rotation is known in the frame where the motion begins
         here = removed.after(self.before)
-        C, D = add_to(sums, rows, intervals, sensors, here)
-        return Stretch(self.start_ns, end_ns, self.bias, self.before, sums, C[0], D[0])
+        C, D = add_to(sums, rows, intervals, sensors, here, are_chained=True)
+        return [
+            Stretch(
+                self.start_ns,
+                end_ns,
+                self.bias,
+                self.before,
+                sums[k : k + 1],
+                C[k],
+                D[k],
+            )
+            for k, end_ns in enumerate(ends_ns)
+        ]
 
     @property
     def motion(self) -> PreintegratedMotion:
@@ -283,7 +303,7 @@ def motion_over(
     """Motion between two instants by linear or held velocities, however far apart the samples are."""
     return (
         Stretch.begin(start_ns, removed.bias)
-        .continued(rows, sensors, removed, end_ns)
+        .continued(rows, sensors, removed, [end_ns])[0]
         .motion
     )
 
@@ -322,18 +342,17 @@ def add_steps(
     rows: Rows,
     intervals: Intervals,
     gyro_density: float,
-    body_p_dvl: Floats,
-    bias: Floats,
-    earth: Floats,
-    sums: Floats,
-) -> tuple[Floats, Floats]:
-    """Add steps to the sums of n intervals, shape (20 n, 3), in place; return C, shape (n, 6, 6), and D, (n, 6, 3).
+    constants: tuple[Floats, Floats, Floats],
+    found: tuple[Floats, Floats, Floats],
+    are_chained: bool,
+) -> None:
+    """Add steps to the sums of n intervals, shape (20 n, 3), and fill in C, shape (n, 6, 6), and D, (n, 6, 3).
 
-    ``bias`` and ``earth`` are those of `Removed`. Each named tuple costs a call a microsecond and more.
+    ``constants`` are ``body_p_dvl``, and bias and Earth's rotation of `Removed`. Arrays that are returned cost microseconds.
     """
+    body_p_dvl, bias, earth = constants
+    sums, C, D = found
     n = len(intervals.start_ns)
-    C = np.empty((n, 6, 6))
-    D = np.empty((n, 6, 3))
     b = vec(bias)
     E = vec(earth)
     lever = vec(body_p_dvl)
@@ -347,14 +366,15 @@ def add_steps(
         imu_rows = rows_until(rows.imu_ns, known)
         dvl_rows = max(rows_until(rows.known_ns, known), 1)
         at = SIZE * e
-        R = mat(sums, (at, 0))
-        p = row_of(sums, at + P)
-        impulse = row_of(sums, at + IMPULSE)
-        tt = mat(sums, (at + TT, 0))
-        rt = mat(sums, (at + RT, 0))
-        rr = mat(sums, (at + RR, 0))
-        D_t = mat(sums, (at + D_T, 0))
-        D_r = mat(sums, (at + D_R, 0))
+        since = at - SIZE if are_chained and e > 0 else at
+        R = mat(sums, (since, 0))
+        p = row_of(sums, since + P)
+        impulse = row_of(sums, since + IMPULSE)
+        tt = mat(sums, (since + TT, 0))
+        rt = mat(sums, (since + RT, 0))
+        rr = mat(sums, (since + RR, 0))
+        D_t = mat(sums, (since + D_T, 0))
+        D_r = mat(sums, (since + D_R, 0))
         # NaN marks the interval for the caller, who bridges the gap
         if has_gap(rows.dvl_ns, dvl_rows, k, t, end, intervals.longest_ns):
             t = end
@@ -403,7 +423,6 @@ def add_steps(
         store6(to_j @ Mat6(tt, rt.T, rt, rr) @ to_j.T, C[e])
         store(to_j.a @ D_t, D[e])
         store(to_j.c @ D_t + to_j.d @ D_r, D[e], LOWER_LEFT)
-    return C, D
 
 
 @inlined
@@ -504,12 +523,6 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
         else:
             high = middle
     return low
-
-
-@inlined
-def row_of(A: Floats, k: int) -> Vec3:
-    """Row k of an array of shape (n, 3) (a view of it would be slow to compile)."""
-    return Vec3(A[k, 0], A[k, 1], A[k, 2])
 
 
 @inlined

@@ -280,6 +280,12 @@ def vec(a: Any) -> Vec3:
 
 
 @inlined
+def row_of(A: Floats, k: int) -> Vec3:
+    """Row k of an array of shape (n, 3) (a view of it would be slow to compile)."""
+    return Vec3(A[k, 0], A[k, 1], A[k, 2])
+
+
+@inlined
 def outer(a: Vec3, b: Vec3) -> Mat3:
     """``a b^T``."""
     return Mat3(a.x * b, a.y * b, a.z * b)
@@ -352,6 +358,27 @@ def store6(A: Mat6, out: Floats) -> None:
     store(A.c.T, out, UPPER_RIGHT)
     store(A.c, out, LOWER_LEFT)
     store(0.5 * (A.d + A.d.T), out, LOWER_RIGHT)
+
+
+@compilable
+def innovation_of(P: Floats, H: Floats, R: Floats) -> tuple[Floats, Floats]:
+    """``H P``, shape (m, n), and ``S = H P H^T + R``, shape (m, m), symmetric to the last bit."""
+    m, n = H.shape
+    HP = np.zeros((m, n))
+    S = R.copy()
+    for r in range(m):
+        for k in range(n):
+            # most numbers of a Jacobian are zero: a detection has nine others in each row
+            if H[r, k] != 0.0:
+                for j in range(n):
+                    HP[r, j] += H[r, k] * P[k, j]
+        for i in range(r + 1):
+            HPH = 0.0
+            for k in range(n):
+                HPH += H[i, k] * HP[r, k]
+            S[r, i] += HPH
+            S[i, r] = S[r, i]
+    return HP, S
 
 
 @inlined

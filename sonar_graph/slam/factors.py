@@ -435,6 +435,7 @@ def gravity_with_bias(
     measured = up_in_body / np.linalg.norm(up_in_body)
     # a unit vector only changes across itself
     A = by_accel - np.outer(measured, measured @ by_accel)
+    by_pose = np.zeros((3, 6))
     by_bias = np.zeros((3, BIASES))
     by_bias[:, ACCEL] = A
 
@@ -443,7 +444,8 @@ def gravity_with_bias(
     ) -> Floats:
         up, by_turn = up_and_derivative(values.atPose3(pose_key).rotation().matrix())
         if jacobians is not None:
-            jacobians[0] = np.hstack((by_turn, np.zeros((3, 3))))
+            by_pose[:, :3] = by_turn
+            jacobians[0] = by_pose
             jacobians[1] = by_bias
         return up + A @ values.atVector(bias_key)[ACCEL] - measured
 

@@ -101,11 +101,11 @@ class Frontend:
             while not later.is_empty:
                 self._apply(later)
                 later = policy.reconsider()
-            for each in decision.assignments:
+            # only nameless detections, which come last, need to know
+            for each in decision.assignments if self._nameless is not None else ():
                 landmark_id = self.landmarks.state(each.sighting).landmark_id
-                if (
-                    landmark_id is not None
-                ):  # it is None where the smoother withheld the sighting
+                # None where the smoother withheld the sighting
+                if landmark_id is not None:
                     taken.add(landmark_id)
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
@@ -121,9 +121,10 @@ class Frontend:
 
     def advance(self, until_ns: int) -> None:
         """Set the keyframes that are due at an instant."""
-        for changed in self._keyframes.advance(until_ns):
+        changes = self._keyframes.advance(until_ns)
+        for changed in changes:
             self._follow(changed)
-        if self._keyframes.newest_ns is not None:
+        if changes:
             self.landmarks.begin(self._keyframes.newest_s)
 
     def smoothed(self) -> Solution:
@@ -148,34 +149,35 @@ class Frontend:
             for landmark_id, why in zip(ids, refusals, strict=True)
         ]
         # a row without an identity may get one by its track or by its place
-        may_wait = detections.track != NO_TRACK
+        tracks = detections.track.tolist()
+        may_wait = [track != NO_TRACK for track in tracks]
         if self._nameless is not None:
-            may_wait |= unnamed(detections)
+            may_wait = [
+                a or b for a, b in zip(may_wait, unnamed(detections), strict=True)
+            ]
         is_open = [
             why is None or (why in UNIDENTIFIED and waits)
-            for why, waits in zip(refusals, may_wait.tolist(), strict=True)
+            for why, waits in zip(refusals, may_wait, strict=True)
         ]
         z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
         noise = detections.range_azimuth_cov
         # then the calibration's noise holds
-        is_unknown = np.isnan(noise).any(axis=(1, 2))
+        is_unknown = np.isnan(noise)
         if is_unknown.any():
             sonar = self._keyframes.calibration.sonar
             noise = noise.copy()
-            noise[is_unknown] = np.diag(
+            noise[is_unknown.any(axis=(1, 2))] = np.diag(
                 [sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]
             )
-        return Frame(detections, stamp_ns, rows, ids, refusals, z, noise).select(
-            np.array(is_open)
-        )
+        frame = Frame(detections, stamp_ns, rows, ids, tracks, refusals, z, noise)
+        return frame.select(is_open)
 
     def _refusals(self, detections: LandmarkDetections) -> list[Outcome | None]:
         """Reason why a row cannot be used, or has no identity; None: it has one, or the policy chooses it by place."""
-        is_sound = detections.are_sound()
-        refusals: list[Outcome | None] = [Outcome.UNSOUND] * len(detections)
-        if not is_sound.any():
-            return refusals
-        sound = detections if is_sound.all() else detections.rows(is_sound)
+        is_sound = detections.are_sound().tolist()
+        if not any(is_sound):
+            return [Outcome.UNSOUND] * len(is_sound)
+        sound = detections if all(is_sound) else detections.rows(np.array(is_sound))
         if self._keyframes.newest_ns is None:
             screened: list[Outcome | None] = [Outcome.UNLOCATED] * len(sound)
         elif detections.stamps_ns[0] < self._keyframes.advanced_ns:
@@ -185,17 +187,16 @@ class Frontend:
             if self._nameless is not None:
                 self._nameless.refuse_taken_ids(sound)
             screened = self.policy.screen(sound)
-        for row, why in zip(np.flatnonzero(is_sound).tolist(), screened, strict=True):
-            refusals[row] = why
-        return refusals
+        rest = iter(screened)
+        return [next(rest) if is_one else Outcome.UNSOUND for is_one in is_sound]
 
     def _shared(self, frame: Frame) -> list[tuple[IdentityPolicy, Frame | None]]:
         """Policies in the order in which they decide, with the detections of each."""
         if self._nameless is None:
             return [(self.policy, frame)]
-        is_nameless = unnamed(frame.detections)
+        is_nameless = unnamed(frame.detections).tolist()
         return [
-            (self.policy, frame.select(~is_nameless)),
+            (self.policy, frame.select([not each for each in is_nameless])),
             (self._nameless, frame.select(is_nameless)),
         ]
 

@@ -114,6 +114,10 @@ class Linearisation(NamedTuple):
     """b of `sonar_graph.models.aiding`, shape (11,)."""
     attitude: Floats
     """world_R_body, shape (3, 3)."""
+    up: Floats
+    """World's up in the body, along which the gyros' bias is split, shape (3,); zero without gravity."""
+    gyro_bias: Floats
+    """Shape (3,), rad/s."""
 
 
 class Interval(NamedTuple):
@@ -129,12 +133,12 @@ def split_at(
     blocks: list[Block], interval: Interval
 ) -> tuple[Block | None, list[Block]]:
     """Samples of an interval as one block, None without any, and the blocks of later samples."""
-    parts = [block.between(interval.start_ns, interval.node_ns) for block in blocks]
-    rests = [block.between(interval.node_ns, LATEST_NS) for block in blocks]
-    inside = [part for part in parts if part is not None]
-    later = [rest for rest in rests if rest is not None]
-    together = type(inside[0]).concatenate(inside) if inside else None
-    return together, later
+    if not blocks:
+        return None, []
+    together = type(blocks[0]).concatenate(blocks)
+    inside = together.between(interval.start_ns, interval.node_ns)
+    later = together.between(interval.node_ns, LATEST_NS)
+    return inside, [] if later is None else [later]
 
 
 class Average(NamedTuple):
@@ -160,14 +164,15 @@ def average_at_end(variance: Floats, wander: Floats) -> Average:
     wander
         q: variance of the odometry from each sample to the next, and from the last to the end, shape (n,).
     """
-    weights = np.zeros(len(variance))
-    P = np.inf
-    for k, (r, q) in enumerate(zip(variance.tolist(), wander.tolist(), strict=True)):
-        K = P / (P + r) if k else 1.0
-        # older samples share the odometry's error: they give way together
-        weights *= 1.0 - K
-        weights[k] = K
-        P = ((1.0 - K) * P if k else r) + q
+    gains = [1.0]
+    P = float(variance[0] + wander[0])
+    for r, q in zip(variance[1:].tolist(), wander[1:].tolist(), strict=True):
+        K = P / (P + r)
+        P = (1.0 - K) * P + q
+        gains.append(K)
+    # older samples share the odometry's error: they give way together
+    weights = np.array(gains)
+    weights[:-1] *= np.cumprod(1.0 - weights[:0:-1])[::-1]
     return Average(weights, P)
 
 
@@ -206,6 +211,7 @@ class Keyframes:
         self.contradictions = Contradictions()
         """Headings and fixes that contradict the estimate at the keyframe after theirs."""
         self._bias_sigmas, self._walks = bias_sigmas(calibration)
+        self._bias_variances = np.square(self._bias_sigmas)
         self._has_accel_bias = (
             calibration.use_gravity and calibration.imu.accel_bias_sigma > 0
         )
@@ -216,8 +222,9 @@ class Keyframes:
         lag_s = min(smoother.params.lag_s, LONGEST_LATE_S)
         self._lag_ns = round(lag_s * NS_PER_S)
         self._bias_since_ns = 0
+        self._newest_key = X(0)
         self._latest: tuple[int, PreintegratedMotion] | None = None
-        self._linearised = Linearisation(np.zeros(BIASES), np.eye(3))
+        self._linearised: Linearisation
         self._depths: list[Depth] = []
         self._headings: list[Heading] = []
         self._newest_heading_ns = EARLIEST_NS
@@ -239,7 +246,7 @@ class Keyframes:
     @property
     def newest_key(self) -> int:
         """Key of the newest keyframe."""
-        return X(len(self.stamps_ns) - 1)
+        return self._newest_key
 
     def tie(self, motion: PreintegratedMotion) -> Tie:
         """An instant that the motion from the newest keyframe leads to."""
@@ -372,16 +379,12 @@ class Keyframes:
 
     def _is_blurred(self, motion: PreintegratedMotion) -> bool:
         """True when the variance of a motion exceeds ``motion_noise_share`` of the sonar's variance."""
-        # (6,)
-        variances = motion.covariance.diagonal() + self._by_biases(motion.D_bias)
+        by_biases = np.square(motion.D_bias) @ self._bias_variances
+        variances = (motion.covariance.diagonal() + by_biases).tolist()  # (6,)
         sonar = self.calibration.sonar
-        turn_share = float(variances[:3].max()) / sonar.azimuth_sigma_rad**2
-        way_share = float(variances[3:].max()) / sonar.range_sigma_m**2
+        turn_share = max(variances[:3]) / sonar.azimuth_sigma_rad**2
+        way_share = max(variances[3:]) / sonar.range_sigma_m**2
         return max(turn_share, way_share) > self.params.motion_noise_share
-
-    def _by_biases(self, D: Floats) -> Floats:
-        """Variances that the biases cause by a derivative, as uncertain as at the start: shape (m, 11) to (m,)."""
-        return np.asarray(np.square(D) @ np.square(self._bias_sigmas))
 
     def _shared_over_gap(
         self, since_ns: int, stamp_ns: int, motion: PreintegratedMotion
@@ -409,7 +412,7 @@ class Keyframes:
         j = i + 1
         start_ns = self.stamps_ns[i]
         world_T_i = self.smoother.estimates.atPose3(X(i))
-        linearisation = Linearisation(self.bias(i), world_T_i.rotation().matrix())
+        linearisation = self._linearisation(i)
         motion = self._motion(start_ns, node_ns, linearisation, known_ns)
         self.smoother.add_pose(
             X(j), world_T_i.compose(motion.i_T_j), node_ns * S_PER_NS
@@ -420,6 +423,7 @@ class Keyframes:
         # the factors up to here hold for the biases of keyframe i
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
+        self._newest_key = X(j)
         self._constrain(j)
         self.odometry.settle(node_ns)
         # a late fix may need the motion from any keyframe of the lag
@@ -468,9 +472,7 @@ class Keyframes:
         self, start_ns: int, end_ns: int, linearisation: Linearisation, known_ns: int
     ) -> PreintegratedMotion:
         """Motion of the odometry, with derivatives by all biases."""
-        biases, attitude = linearisation
-        up = self._up(attitude)
-        gyro_bias = gyro_bias_of(biases, up)
+        biases, attitude, up, gyro_bias = linearisation
         motion = self.odometry.motion(start_ns, end_ns, gyro_bias, attitude, known_ns)
         # the odometry differentiates by the gyro bias alone, and has taken away no other
         dR = motion.i_T_j.rotation().matrix()
@@ -482,24 +484,32 @@ class Keyframes:
             attitude[2],
             self._body_p_dvl,
         )
-        removed = np.concatenate((gyro_bias, gyro_bias, np.zeros(BIASES - 6)))  # (11,)
         # then to first order by the other biases
-        by_others = gtsam.Pose3.Expmap(D @ (biases - removed))
-        return replace(
-            motion, i_T_j=motion.i_T_j.compose(by_others), D_bias=D, bias=biases
+        others = biases.copy()  # (11,)
+        others[TILT] -= gyro_bias
+        others[HEADING] -= gyro_bias
+        return PreintegratedMotion(
+            motion.i_T_j.compose(gtsam.Pose3.Expmap(D @ others)),
+            motion.covariance,
+            D,
+            biases,
+            motion.duration_s,
+            motion.mean_specific_force,
         )
 
-    def _up(self, attitude: Floats) -> Floats:
-        """The world's up in the body, along which the gyros' bias is split, shape (3,); zero without gravity."""
-        return np.asarray(attitude[2]) if self.calibration.use_gravity else np.zeros(3)
+    def _linearisation(self, i: int) -> Linearisation:
+        """Where motions from keyframe i are linearised now."""
+        biases = self.bias(i)
+        attitude = self.smoother.estimates.atPose3(X(i)).rotation().matrix()
+        up = attitude[2] if self.calibration.use_gravity else np.zeros(3)
+        return Linearisation(biases, attitude, up, gyro_bias_of(biases, up))
 
     def _linearise(self) -> None:
         """Fix biases and attitude for the motions from a new keyframe at their estimates when it is set.
 
         If they were fixed at the first call that needs a motion, results would depend on the calls.
         """
-        attitude = self.smoother.estimates.atPose3(self.newest_key).rotation().matrix()
-        self._linearised = Linearisation(self.bias(len(self.stamps_ns) - 1), attitude)
+        self._linearised = self._linearisation(len(self.stamps_ns) - 1)
         self._latest = None
 
     # ---------------------------------------------------------------- factors of a new keyframe
@@ -510,7 +520,7 @@ class Keyframes:
         between: gtsam.NonlinearFactor
         if self._has_motion_biases:
             # R^T up
-            up_j = self._up(linearisation.attitude) @ motion.i_T_j.rotation().matrix()
+            up_j = linearisation.up @ motion.i_T_j.rotation().matrix()
             between = OdometryWithBias(X(i), X(i + 1), self.bias_keys[i], motion, up_j)
         else:
             between = factors.odometry(X(i), X(i + 1), motion)
@@ -544,7 +554,7 @@ class Keyframes:
         self, j: int, interval: Interval, linearisation: Linearisation
     ) -> None:
         """Add one factor for the depths since the last keyframe, and one for the headings."""
-        gyro_bias = gyro_bias_of(linearisation.biases, self._up(linearisation.attitude))
+        gyro_bias = linearisation.gyro_bias
         depths, self._depths = split_at(self._depths, interval)
         if depths is not None:
             carried = self._carried(depths.stamps_ns, interval, gyro_bias)
@@ -575,7 +585,8 @@ class Keyframes:
         up_j = self.smoother.estimates.atPose3(X(j)).rotation().matrix()[2]
         # only the part of the odometry's error along the vertical moves a depth
         ups = carried.k_R_j[1:] @ up_j  # (n, 3)
-        wander_m2 = np.einsum("ka,kab,kb->k", ups, carried.C[:, 3:, 3:], ups)
+        of_ups = carried.C[:, 3:, 3:] @ ups[:, :, None]  # (n, 3, 1)
+        wander_m2 = np.vecdot(ups, of_ups[:, :, 0])
         z_m = depth.z_m
         given_m2 = depth.variance_m2
         variance_m2 = np.where(
@@ -583,7 +594,7 @@ class Keyframes:
         )
         average = average_at_end(variance_m2, wander_m2)
         port = np.array(self.calibration.depth.port_m)
-        ports = np.einsum("kba,kb->ka", carried.k_R_j[:-1], port - carried.k_p_j[:-1])
+        ports = ((port - carried.k_p_j[:-1])[:, None] @ carried.k_R_j[:-1])[:, 0]
         height_m = float(average.weights @ z_m)
         sigma_m = average.variance**0.5
         self.smoother.add(
@@ -650,9 +661,11 @@ class Keyframes:
         if stamp_ns >= self.advanced_ns:
             motion = self.motion_since_newest(stamp_ns)
         else:  # late: from an earlier keyframe, by rows that are known by now
-            linearisation = Linearisation(self.bias(i), world_R_i)
             motion = self._motion(
-                self.stamps_ns[i], stamp_ns, linearisation, self.advanced_ns
+                self.stamps_ns[i],
+                stamp_ns,
+                self._linearisation(i),
+                self.advanced_ns,
             )
         motion = self._shared_over_gap(self.stamps_ns[i], stamp_ns, motion)
         antenna = np.array(self.calibration.positions.antenna_m)

@@ -62,7 +62,18 @@ UNWHITENED = np.eye(6)[None]
 class OdometryError:
     """Error of one factor, called by GTSAM."""
 
-    __slots__ = ("D", "_R", "_motion", "_p", "_poses", "bias_0", "h", "i_T_j", "keys")
+    __slots__ = (
+        "D",
+        "_R",
+        "_motion",
+        "_p",
+        "_poses",
+        "_result",
+        "bias_0",
+        "h",
+        "i_T_j",
+        "keys",
+    )
 
     def __init__(
         self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats
@@ -82,6 +93,7 @@ class OdometryError:
         self._poses = np.empty((2, 1, 12))
         self._R = self._poses[:, 0, :9].reshape(2, 3, 3)
         self._p = self._poses[:, 0, 9:]
+        self._result = OdometryDerivatives.empty(1, len(self.h))
 
     def __call__(
         self,
@@ -97,12 +109,13 @@ class OdometryError:
         X_i, X_j = self._poses  # (1, 12) each
         change = (values.atVector(self.keys[2]) - self.bias_0)[None]  # (1, 11)
         if jacobians is None:
-            return odometry_errors(X_i, X_j, change, *self._motion)[0]
-        e, by_i, by_j, by_b = odometry_derivatives(X_i, X_j, change, *self._motion)
-        jacobians[0] = by_i[0].T  # back to rows
-        jacobians[1] = by_j[0].T
-        jacobians[2] = by_b[0].T
-        return np.asarray(e[0])
+            return odometry_errors(X_i, X_j, change, self._motion)[0]
+        found = self._result
+        write_derivatives(X_i, X_j, change, self._motion, (*found,))
+        jacobians[0] = found.by_i[0].T  # back to rows
+        jacobians[1] = found.by_j[0].T
+        jacobians[2] = found.by_b[0].T
+        return found.errors[0]
 
 
 class OdometryWithBias(gtsam.CustomFactor):
@@ -129,17 +142,32 @@ class OdometryWithBias(gtsam.CustomFactor):
         )
 
 
-class BiasedMotions(NamedTuple):
-    """Constants of n motions."""
+BiasedMotions = tuple[Floats, Floats, Floats, Floats]
+"""Constants of n motions: rows of R, and p, shape (n, 12); D, shape (n, 6, 11); h, shape (n, 11); W with ``W C W^T = I``,
+shape (n, 6, 6)."""
 
-    i_T_j: Floats
-    """Rows of R, and p, shape (n, 12)."""
-    D: Floats
-    """Shape (n, 6, 11)."""
-    h: Floats
-    """Shape (n, 11)."""
-    whitening: Floats
-    """W with ``W C W^T = I``, shape (n, 6, 6)."""
+
+class OdometryDerivatives(NamedTuple):
+    """Errors of n motions, and their derivatives, transposed."""
+
+    errors: Floats
+    """Shape (n, 6)."""
+    by_i: Floats
+    """By the first pose, shape (n, 6, 6)."""
+    by_j: Floats
+    """By the second pose, shape (n, 6, 6)."""
+    by_b: Floats
+    """By b, shape (n, 11, 6)."""
+
+    @classmethod
+    def empty(cls, n: int, biases: int) -> OdometryDerivatives:
+        """Arrays to be filled."""
+        return cls(
+            np.empty((n, 6)),
+            np.empty((n, 6, 6)),
+            np.empty((n, 6, 6)),
+            np.empty((n, biases, 6)),
+        )
 
 
 class OdometryStack:
@@ -155,21 +183,23 @@ class OdometryStack:
         )
         self._bias_0 = np.array([law.bias_0 for law in laws])
         covariances = np.array([factor.covariance for factor in factors])
-        self._motions = BiasedMotions(
-            i_T_j=np.array([law.i_T_j for law in laws]),
-            D=np.array([law.D for law in laws]),
-            h=np.array([law.h for law in laws]),
-            whitening=np.linalg.inv(np.linalg.cholesky(covariances)),
+        self._motions = (
+            np.array([law.i_T_j for law in laws]),
+            np.array([law.D for law in laws]),
+            np.array([law.h for law in laws]),
+            np.linalg.inv(np.linalg.cholesky(covariances)),
         )
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squared whitened errors."""
-        e = odometry_errors(*self._states(values), *self._motions)
+        e = odometry_errors(*self._states(values), self._motions)
         return 0.5 * float(np.vdot(e, e))
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised."""
-        e, *columns = odometry_derivatives(*self._states(values), *self._motions)
+        found = OdometryDerivatives.empty(*self._motions[2].shape)
+        write_derivatives(*self._states(values), self._motions, (*found,))
+        e, *columns = found
         # stored by columns, as GTSAM stores them
         blocks = (transposed.transpose(0, 2, 1) for transposed in columns)
         return [
@@ -190,18 +220,13 @@ class OdometryStack:
 OdometryWithBias.Stack = OdometryStack
 
 
-# GTSAM calls these for single factors: arrays, since numba takes longer to recognise a named tuple than to evaluate one
+# GTSAM calls these for single factors: numba takes longer to return an array, or a named tuple, than to evaluate one
 @compiled
 def odometry_errors(
-    X_i: Floats,
-    X_j: Floats,
-    changes: Floats,
-    i_T_j: Floats,
-    D: Floats,
-    h: Floats,
-    whitening: Floats,
+    X_i: Floats, X_j: Floats, changes: Floats, motions: BiasedMotions
 ) -> Floats:
-    """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states` and `BiasedMotions`."""
+    """Whitened errors of n motions, shape (n, 6), from `OdometryStack._states`."""
+    i_T_j, D, h, whitening = motions
     errors = np.empty((len(i_T_j), 6))
     for k in range(len(i_T_j)):
         found = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
@@ -210,21 +235,17 @@ def odometry_errors(
 
 
 @compiled
-def odometry_derivatives(
+def write_derivatives(
     X_i: Floats,
     X_j: Floats,
     changes: Floats,
-    i_T_j: Floats,
-    D: Floats,
-    h: Floats,
-    whitening: Floats,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """As `odometry_errors`, with the transposed derivatives by both poses, shape (n, 6, 6), and b, shape (n, 11, 6)."""
+    motions: BiasedMotions,
+    linear: tuple[Floats, Floats, Floats, Floats],
+) -> None:
+    """As `odometry_errors`; fills the arrays of `OdometryDerivatives`."""
+    i_T_j, D, h, whitening = motions
+    errors, by_i, by_j, by_b = linear
     n, biases = changes.shape
-    errors = np.empty((n, 6))
-    by_i = np.empty((n, 6, 6))
-    by_j = np.empty((n, 6, 6))
-    by_b = np.empty((n, biases, 6))
     for k in range(n):
         found = evaluated(X_i[k], X_j[k], changes[k], i_T_j[k], D[k], h[k])
         W = mat6(whitening[k])
@@ -250,7 +271,6 @@ def odometry_derivatives(
                 m,
                 0,
             )
-    return errors, by_i, by_j, by_b
 
 
 class Transform(NamedTuple):

@@ -26,23 +26,40 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from sonar_graph.measurements import Floats
-from sonar_graph.models import Mount, sight_of, view_points, wrap_angle
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.models import Mount, sight_of, wrap_angle
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import (
+    LOWER_LEFT,
+    LOWER_RIGHT,
+    UPPER_LEFT,
     Vec3,
     Vec6,
     compiled,
     cross,
+    inlined,
+    innovation_of,
     mat,
     mat6,
+    row_of,
+    skew,
+    store,
     store_row,
-    vec,
+    store_row6,
 )
 from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
 from sonar_graph.states import Estimate, Trajectory
 
 TRIANGLE = np.tril_indices(6)
+NO_BIASES = np.zeros((6, 0))
+"""D of a motion that does not depend on biases."""
+
+
+# numba takes longer to recognise a named tuple, or to return an array, than to evaluate a frame
+Moved = tuple[Floats, Floats, Floats]
+"""Motion as arrays: mean, shape (4, 4), D, shape (6, 11) or `NO_BIASES`, and Q."""
+SonarOnBody = tuple[Floats, Floats]
+"""Pose of the body in the world, and of the sonar in the body, shape (4, 4)."""
 
 
 class Tie(NamedTuple):
@@ -61,15 +78,10 @@ class Tie(NamedTuple):
             [self.pose_key] if self.bias_key is None else [self.pose_key, self.bias_key]
         )
 
-    def by_state(self, i_T_j: gtsam.Pose3, covariance: JointCovariance) -> Floats:
-        """J of (1), by all variables of a joint covariance, shape (6, N), for the motion as corrected for biases."""
-        J = np.zeros((6, len(covariance.matrix)))
-        row = covariance.rows[self.pose_key]
-        J[:, row : row + 6] = i_T_j.inverse().AdjointMap()
-        if self.bias_key is not None:
-            row = covariance.rows[self.bias_key]
-            J[:, row : row + len(self.motion.bias)] = self.motion.D_bias
-        return J
+    def moved(self, i_T_j: gtsam.Pose3) -> Moved:
+        """The motion as arrays, with the mean as corrected for biases."""
+        D = NO_BIASES if self.bias_key is None else self.motion.D_bias
+        return i_T_j.matrix(), D, self.motion.covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +100,9 @@ class AnchoredPose:
             if bias_key is None
             else motion.corrected(values.atVector(bias_key))
         )
-        J = self.tie.by_state(i_T_j, joint)
-        cov = J @ joint.matrix @ J.T + motion.covariance
-        return Estimate(
-            self.stamp_ns, values.atPose3(pose_key).compose(i_T_j), 0.5 * (cov + cov.T)
-        )
+        rows = joint.first_rows(self.tie.keys)
+        cov = carried_covariance(self.tie.moved(i_T_j), joint.matrix, rows)
+        return Estimate(self.stamp_ns, values.atPose3(pose_key).compose(i_T_j), cov)
 
 
 class PoseHistory:
@@ -218,46 +228,30 @@ class PredictedView:
         body_T_sonar: gtsam.Pose3,
         covariance: JointCovariance,
     ) -> None:
-        motion = tie.motion
-        world_T_body = world_T_keyframe.compose(motion.i_T_j)
+        world_T_body = world_T_keyframe.compose(tie.motion.i_T_j)
         self.world_T_sonar = world_T_body.compose(body_T_sonar)
         """Pose of the sonar at the frame."""
-        self._keyframe = as_arrays(world_T_keyframe)
-        self._body = as_arrays(world_T_body)
-        self._sonar = as_arrays(self.world_T_sonar)
-        self._mount = Mount(*as_arrays(body_T_sonar))
+        self._tie = tie
+        self._keyframe = world_T_keyframe.matrix()
+        self._sonar = world_T_body.matrix(), body_T_sonar.matrix()
         self._covariance = covariance
-        self._motion = motion
-        self._pose_row = covariance.rows[tie.pose_key]
-        self._by_body = body_T_sonar.inverse().AdjointMap()
-        """Derivative of the sonar's pose by the body's, both at the frame, shape (6, 6)."""
-        self._by_state = self._by_body @ tie.by_state(motion.i_T_j, covariance)
-        """Derivative of the sonar's pose by all variables of the covariance, shape (6, N)."""
 
-    def height_variances(self, points: Floats) -> Floats:
-        """Variance of the world z of points fixed to the body at the frame, shape (m,), m².
+    def beams(self, z: Floats) -> tuple[Floats, Floats]:
+        """Points of the world at range and azimuth, (m, 2), and elevation 0, and how sure their height is.
 
-        Keyframe and motion count. The gyro bias is left out: it turns mostly about the vertical.
-
-        Parameters
-        ----------
-        points
-            In the world, shape (m, 3).
+        Returns
+        -------
+        Points, shape (m, 3), m, and the variance of their world z by keyframe and motion, shape (m,), m². The gyro bias
+        is left out: it turns mostly about the vertical.
         """
-        row = self._pose_row
-        P = self._covariance.matrix[row : row + 6, row : row + 6]
-        P = np.ascontiguousarray(P)
-        from_keyframe = height_variances(*self._keyframe, P, points)
-        from_motion = height_variances(*self._body, self._motion.covariance, points)
-        return np.asarray(from_keyframe + from_motion)
-
-    def beam_points(self, z: Floats) -> Floats:
-        """Points of the world at range and azimuth, (m, 2), and elevation 0, shape (m, 3), m."""
-        return beam_points(*self._sonar, z)
-
-    def world_z_by_elevation(self) -> float:
-        """Height by which a point at elevation 0 rises for each radian of elevation and metre of range."""
-        return float(self._sonar[0][2, 2])
+        joint = self._covariance
+        row = joint.rows[self._tie.pose_key]
+        P = np.ascontiguousarray(joint.matrix[row : row + 6, row : row + 6])
+        points = np.empty((len(z), 3))
+        variance = np.empty(len(z))
+        covariances = (P, self._tie.motion.covariance)
+        write_beams(self._sonar, self._keyframe, covariances, z, (points, variance))
+        return points, variance
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
         """Expected range and azimuth of landmarks at points of the world, shape (m, 3).
@@ -266,11 +260,11 @@ class PredictedView:
         -------
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
-        predicted, joint = self.expect_jointly(keys, points, [])
+        expected, joint = self.expect_jointly(keys, points, [])
         m = len(keys)
         place = np.arange(m)
         # blocks on the diagonal
-        return predicted, joint.reshape(m, 2, m, 2)[place, :, place]
+        return expected, joint.reshape(m, 2, m, 2)[place, :, place]
 
     def expect_jointly(
         self, keys: list[int], points: Floats, sources: list[Source]
@@ -281,37 +275,22 @@ class PredictedView:
         -------
         Range (m) and azimuth (rad), shape (m + s, 2), and their joint covariance, shape (2 (m + s), 2 (m + s)).
         """
+        joint = self._covariance
+        P = joint.matrix
+        rows = joint.first_rows([*self._tie.keys, *keys])
         if sources:
             points = np.array([*points, *(source.point for source in sources)])
-        predicted, by_sonar, by_point = view_points(self.world_T_sonar, points)
-        rows = self._covariance.rows
-        P = self._covariance.matrix
-        Q = self._motion.covariance
-        n = len(points)
-        H = by_sonar @ self._by_state  # (n, 2, N)
-        for k, key in enumerate(keys):
-            H[k, :, rows[key] : rows[key] + 3] = by_point[k]
-        for k, source in enumerate(sources, start=len(keys)):
-            # += : the point may have been seen from the keyframe itself
-            H[k, :, rows[source.pose_key] : rows[source.pose_key] + 6] += (
-                by_point[k] @ source.by_pose
-            )
-        H = H.reshape(2 * n, len(P))
-        H_M = (by_sonar @ self._by_body).reshape(2 * n, 6)
-        joint = H @ P @ H.T + H_M @ Q @ H_M.T  # (2)
-        for k, source in enumerate(sources, start=len(keys)):
-            # own noise of the point, independent of all variables of the graph
-            joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += (
-                by_point[k] @ source.cov @ by_point[k].T
-            )
-        return predicted, np.asarray(0.5 * (joint + joint.T))
+            located = np.arange(len(P), len(P) + 3 * len(sources), 3)
+            rows = np.concatenate((rows, located))
+            P = with_sources(joint, sources)
+        moved = self._tie.moved(self._tie.motion.i_T_j)
+        return expected_views(self._sonar, moved, P, rows, points)
 
     def compare(
         self, keys: list[int], points: Floats, z: Floats, cov: Floats
     ) -> Compared:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
-        predicted, prior_cov = self.expect(keys, points)
-        return weigh(z, predicted, prior_cov, cov)
+        return weigh(z, *self.expect_jointly(keys, points, []), cov)
 
     def blurred(
         self, cov: Floats, motion: PreintegratedMotion, points: Floats
@@ -321,24 +300,43 @@ class PredictedView:
         Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
         noise = cov.copy()
-        blur(*self._body, self._mount, motion.covariance, points, noise)
+        blur(self._sonar, motion.covariance, points, noise)
         return noise
 
 
-def weigh(z: Floats, expected: Floats, prior_cov: Floats, cov: Floats) -> Compared:
-    """Compare m detections and their noise with the expectation and its covariance."""
-    return Compared(*compared_columns(z, expected, prior_cov, cov))
+def with_sources(covariance: JointCovariance, sources: list[Source]) -> Floats:
+    """Joint covariance of all variables, shape (N, N), and of s located points after them, (N + 3 s, N + 3 s)."""
+    P = covariance.matrix
+    by_variables = np.zeros((3 * len(sources), len(P)))
+    own = np.zeros((3 * len(sources), 3 * len(sources)))
+    for k, source in enumerate(sources):
+        of_point = slice(3 * k, 3 * k + 3)
+        row = covariance.rows[source.pose_key]
+        by_variables[of_point, row : row + 6] = source.by_pose
+        # independent of all variables of the graph
+        own[of_point, of_point] = source.cov
+    of_both = by_variables @ P
+    return np.block([[P, of_both.T], [of_both, of_both @ by_variables.T + own]])
+
+
+def weigh(z: Floats, expected: Floats, joint: Floats, cov: Floats) -> Compared:
+    """Compare m detections and their noise with the expectation and its joint covariance, shape (2 m, 2 m)."""
+    m = len(z)
+    found = Compared(np.empty((m, 2)), np.empty((m, 2, 2)), np.empty(m), np.empty(m))
+    write_compared(z, expected, joint, cov, (*found,))
+    return found
 
 
 @compiled
-def compared_columns(
-    z: Floats, expected: Floats, prior_cov: Floats, cov: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Columns of `Compared`."""
-    innovation = np.empty(z.shape)
-    S = np.empty(cov.shape)
-    distance = np.empty(len(z))
-    gain = np.empty(len(z))
+def write_compared(
+    z: Floats,
+    expected: Floats,
+    joint: Floats,
+    cov: Floats,
+    found: tuple[Floats, Floats, Floats, Floats],
+) -> None:
+    """Fill the columns of `Compared`."""
+    innovation, S, distance, gain = found
     for k in range(len(z)):
         r = z[k, 0] - expected[k, 0]
         alpha = wrap_angle(z[k, 1] - expected[k, 1])
@@ -346,57 +344,140 @@ def compared_columns(
         innovation[k, 1] = alpha
         for i in range(2):
             for j in range(2):
-                S[k, i, j] = prior_cov[k, i, j] + cov[k, i, j]
+                S[k, i, j] = joint[2 * k + i, 2 * k + j] + cov[k, i, j]
         a = S[k, 0, 0]
         b = S[k, 0, 1]
         c = S[k, 1, 1]
         # e' S^-1 e with the closed inverse of a 2 x 2 matrix
         squares = c * r**2 - 2.0 * b * r * alpha + a * alpha**2
         distance[k] = squares / (a * c - b**2)
-        gain[k] = max(
-            prior_cov[k, 0, 0] / cov[k, 0, 0], prior_cov[k, 1, 1] / cov[k, 1, 1]
-        )
-    return innovation, S, distance, gain
+        of_range = joint[2 * k, 2 * k] / cov[k, 0, 0]
+        gain[k] = max(of_range, joint[2 * k + 1, 2 * k + 1] / cov[k, 1, 1])
 
 
-@compiled
-def height_variances(R: Floats, X: Floats, C: Floats, points: Floats) -> Floats:
-    """Variances of the world z of points fixed to a body, shape (m,), m², by the covariance C of the body's pose.
+@inlined
+def by_state(moved: Moved) -> Floats:
+    """J of (1), shape (6, n): by the keyframe, then by the biases if the motion depends on them."""
+    i_T_j, D, _ = moved
+    J = np.zeros((6, 6 + D.shape[1]))
+    R_inverse = mat(i_T_j).T
+    store(R_inverse, J, UPPER_LEFT)  # Ad(M^-1)
+    store(-1.0 * (R_inverse @ skew(position(i_T_j))), J, LOWER_LEFT)
+    store(R_inverse, J, LOWER_RIGHT)
+    # assigning to a slice would take seconds to compile
+    for i in range(6):
+        for k in range(D.shape[1]):
+            J[i, 6 + k] = D[i, k]
+    return J
 
-    ``(R, X)``: pose of the body; C: of its right perturbation, shape (6, 6); points in the world, shape (m, 3).
-    """
-    found = np.empty(len(points))
-    world_R_body = mat(R)
-    up = world_R_body.z  # in the body
-    for k in range(len(points)):
-        off = Vec3(points[k, 0] - X[0], points[k, 1] - X[1], points[k, 2] - X[2])
-        h = Vec6(cross(world_R_body.T @ off, up), up)
-        found[k] = h @ (mat6(C) @ h)
+
+@inlined
+def joint_of(P: Floats, rows: Ints, biases: int) -> Floats:
+    """Joint covariance of keyframe, biases and points; P is that of more variables, where they begin at these rows."""
+    places = np.empty(6 + biases + 3 * len(rows), np.int64)
+    n = 0
+    for k in range(len(rows)):
+        size = 3
+        if k == 0:
+            size = 6
+        elif k == 1 and biases > 0:
+            size = biases
+        for i in range(size):
+            places[n] = rows[k] + i
+            n += 1
+    found = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            found[i, j] = P[places[i], places[j]]
     return found
 
 
 @compiled
-def blur(
-    R: Floats, X: Floats, mount: Mount, C: Floats, points: Floats, noise: Floats
-) -> None:
+def carried_covariance(moved: Moved, P: Floats, rows: Ints) -> Floats:
+    """(1), shape (6, 6); P and rows are those of `joint_of`."""
+    J = by_state(moved)
+    _, D, Q = moved
+    _, JPJ_Q = innovation_of(joint_of(P, rows, D.shape[1]), J, Q)
+    return JPJ_Q
+
+
+@compiled
+def expected_views(
+    sonar: SonarOnBody, moved: Moved, P: Floats, rows: Ints, points: Floats
+) -> tuple[Floats, Floats]:
+    """Range and azimuth of m points, shape (m, 2), after a motion, and their joint covariance (2), shape (2 m, 2 m).
+
+    P and rows are those of `joint_of`.
+    """
+    world_T_body, body_T_sonar = sonar
+    _, D, Q = moved
+    m = len(points)
+    expected = np.empty((m, 2))
+    mount = Mount(body_T_sonar, body_T_sonar[:3, 3])
+    J = by_state(moved)
+    n = J.shape[1]
+    H = np.zeros((2 * m, n + 3 * m))
+    H_M = np.empty((2 * m, 6))
+    for k in range(m):
+        point = row_of(points, k)
+        sight = sight_of(mat(world_T_body), position(world_T_body), mount, point)
+        expected[k, 0] = sight.range_m
+        expected[k, 1] = sight.azimuth_rad
+        store_row6(sight.range_by_body, H_M, 2 * k, 0)
+        store_row6(sight.azimuth_by_body, H_M, 2 * k + 1, 0)
+        store_row(sight.range_by_point, H, 2 * k, n + 3 * k)
+        store_row(sight.azimuth_by_point, H, 2 * k + 1, n + 3 * k)
+    for r in range(2 * m):
+        for i in range(6):
+            for c in range(n):
+                H[r, c] += H_M[r, i] * J[i, c]  # H_M J
+    _, HQH = innovation_of(Q, H_M, np.zeros((2 * m, 2 * m)))
+    _, S_0 = innovation_of(joint_of(P, rows, D.shape[1]), H, HQH)
+    return expected, S_0
+
+
+@compiled
+def blur(sonar: SonarOnBody, C: Floats, points: Floats, noise: Floats) -> None:
     """Add to the noise of range and azimuth of points, (m, 2, 2), their variances by the covariance C of the body."""
+    world_T_body, body_T_sonar = sonar
+    mount = Mount(body_T_sonar, body_T_sonar[:3, 3])
     for k in range(len(points)):
-        point = Vec3(points[k, 0], points[k, 1], points[k, 2])
-        sight = sight_of(mat(R), vec(X), mount, point)
+        point = row_of(points, k)
+        sight = sight_of(mat(world_T_body), position(world_T_body), mount, point)
         noise[k, 0, 0] += sight.range_by_body @ (mat6(C) @ sight.range_by_body)
         noise[k, 1, 1] += sight.azimuth_by_body @ (mat6(C) @ sight.azimuth_by_body)
 
 
 @compiled
-def beam_points(R: Floats, t: Floats, z: Floats) -> Floats:
-    """Points of the world at range and azimuth of a sonar at ``(R, t)`` and elevation 0, shape (m, 3), m."""
-    found = np.empty((len(z), 3))
+def write_beams(
+    sonar: SonarOnBody,
+    world_T_keyframe: Floats,
+    covariances: tuple[Floats, Floats],
+    z: Floats,
+    found: tuple[Floats, Floats],
+) -> None:
+    """Fill in points and variances of `PredictedView.beams`; covariances of the keyframe's pose and of the motion."""
+    world_T_body, body_T_sonar = sonar
+    P, Q = covariances
+    points, variance = found
     for k in range(len(z)):
         on_beam = Vec3(z[k, 0] * math.cos(z[k, 1]), z[k, 0] * math.sin(z[k, 1]), 0.0)
-        store_row(vec(t) + mat(R) @ on_beam, found, k, 0)
-    return found
+        q = position(body_T_sonar) + mat(body_T_sonar) @ on_beam
+        point = position(world_T_body) + mat(world_T_body) @ q
+        store_row(point, points, k, 0)
+        h = height_by_body(world_T_keyframe, point)
+        h_M = height_by_body(world_T_body, point)
+        variance[k] = h @ (mat6(P) @ h) + h_M @ (mat6(Q) @ h_M)
 
 
-def as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
-    """Rotation and position, in the layout for which compiled code exists."""
-    return np.ascontiguousarray(pose.rotation().matrix()), pose.translation()
+@inlined
+def position(T: Floats) -> Vec3:
+    """Position of a pose of shape (4, 4)."""
+    return Vec3(T[0, 3], T[1, 3], T[2, 3])
+
+
+@inlined
+def height_by_body(T: Floats, point: Vec3) -> Vec6:
+    """Derivative of the world z of a point that is fixed to a body, by the body's pose T, shape (4, 4)."""
+    up = mat(T).z  # in the body
+    return Vec6(cross(mat(T).T @ (point - position(T)), up), up)

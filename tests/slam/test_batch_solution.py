@@ -6,7 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam import factors
-from sonar_graph.slam.smoother import Sightline, Smoother, solve
+from sonar_graph.slam.smoother import FactorGroup, Sightline, Smoother, solve
 from sonar_graph.slam.smoother.batch_solution import misplaced, placed_again
 from sonar_graph.slam.smoother.factor_store import Sightlines
 
@@ -89,7 +89,7 @@ def smoother_at(
         made = factors.landmark_sighting(
             X(0), L(1), BODY_T_SONAR, z, np.eye(2) * sigma**2, kernel, 0.07
         )
-        smoother.add(made, (L(1), Sightline(X(0), BODY_T_SONAR, z)))
+        smoother.add(FactorGroup(made, (L(1), Sightline(X(0), BODY_T_SONAR, z))))
     return smoother
 
 

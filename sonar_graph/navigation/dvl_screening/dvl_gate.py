@@ -27,13 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.preintegration import covariance, row_of, rows_until
+from sonar_graph.navigation.preintegration import covariance, rows_until
 from sonar_graph.navigation.samples import (
     LATEST_NS,
     VelocityRow,
     VelocityRows,
 )
-from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined
+from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined, row_of
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import Refusal, RefusedRow
 

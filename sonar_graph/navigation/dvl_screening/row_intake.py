@@ -97,8 +97,7 @@ class RowIntake:
         force = rows.specific_force
         # a fault of the transmission: the row is refused whole
         is_used = np.ones(len(rate), np.bool_)
-        _write_within(rate, force, is_used)
-        if not is_used.all():
+        if not _write_within(rate, force, is_used):
             self._refuse("imu", rows.stamps_ns[~is_used], Refusal.BEYOND_SENSOR)
             if not is_used.any():
                 return False
@@ -252,13 +251,16 @@ class RowIntake:
 
 
 @compiled
-def _write_within(rate: Floats, force: Floats, is_within: NDArray[np.bool_]) -> None:
-    """Write False for rows whose angular rate or specific force no sensor can measure; shape (n,)."""
+def _write_within(rate: Floats, force: Floats, is_within: NDArray[np.bool_]) -> bool:
+    """Write False for rows whose angular rate or specific force no sensor can measure; shape (n,). True without any."""
+    are_within = True
     for k in range(len(rate)):
         for i in range(3):
             # NaN is not beyond
             if abs(rate[k, i]) > MOST_RATE_RAD_S or abs(force[k, i]) > MOST_FORCE_M_S2:
                 is_within[k] = False
+                are_within = False
+    return are_within
 
 
 @compiled

@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Set
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import gtsam
@@ -442,8 +443,9 @@ class LandmarkGraph:
                 else new.start
             )
             self.smoother.add_landmark(key, start)
-        made = self.factors.make(new.sighting, key, is_first=is_first)
-        handle = self.smoother.add(made, (key, new.sighting.line), gain=new.gain)
+        make = partial(self.factors.make, new.sighting, key, is_first=is_first)
+        group = FactorGroup(make, (key, new.sighting.line))
+        handle = self.smoother.add(group, gain=new.gain)
         self._insert(new.sighting, new.landmark_id, handle)
 
     def _exchange(

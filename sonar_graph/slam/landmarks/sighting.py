@@ -11,7 +11,6 @@ from itertools import compress
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats, LandmarkDetections
@@ -127,6 +126,8 @@ class Frame:
     """Rows of the detections in the journal."""
     ids: list[int]
     """Most probable identity of each detection."""
+    tracks: list[int]
+    """Track of each detection, or `NO_TRACK`."""
     refusals: list[Outcome | None]
     """Reason why that identity is not accepted; None: it is."""
     z: Floats
@@ -137,24 +138,26 @@ class Frame:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, is_in: NDArray[np.bool_]) -> "Frame | None":
+    def select(self, is_in: list[bool]) -> "Frame | None":
         """Some of the detections; None for an empty selection."""
-        if is_in.all():
+        if all(is_in):
             return self
-        if not is_in.any():
+        if not any(is_in):
             return None
+        mask = np.array(is_in)
         return replace(
             self,
-            detections=self.detections.rows(is_in),
+            detections=self.detections.rows(mask),
             rows=list(compress(self.rows, is_in)),
             ids=list(compress(self.ids, is_in)),
+            tracks=list(compress(self.tracks, is_in)),
             refusals=list(compress(self.refusals, is_in)),
-            z=self.z[is_in],
-            noise=self.noise[is_in],
+            z=self.z[mask],
+            noise=self.noise[mask],
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SeenFrame:
     """Detections of a frame, with their prediction and the keyframe to which their sightings are tied."""
 
@@ -169,9 +172,14 @@ class SeenFrame:
     """Landmarks that other detections of the frame show."""
     factors: SightingFactors
 
+    def __post_init__(self) -> None:
+        self._points, height_variance = self.view.beams(self.frame.z)
+        self.floors = self._floors_under(height_variance)
+        """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
+
     def beam_points(self, rows: list[int]) -> Floats:
         """Points of the world at the measured range and azimuth and elevation 0, shape (len(rows), 3), m."""
-        return self.view.beam_points(self.frame.z[rows])
+        return self._points[rows]
 
     def sightings(
         self, rows: list[int], points: Floats, elevation_rad: float = 0.0
@@ -197,24 +205,22 @@ class SeenFrame:
                 row=frame.rows[row],
                 line=Sightline(self.tie.pose_key, keyframe_T_sonar, frame.z[row]),
                 noise=R,
-                floor=floor,
+                floor=self.floors[row],
                 elevation_rad=elevation_rad,
             )
-            for row, R, floor in zip(rows, noise, self.floors_under(rows), strict=True)
+            for row, R in zip(rows, noise, strict=True)
         ]
 
-    def floors_under(self, rows: list[int]) -> list[FloorPrior | None]:
-        """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
+    def _floors_under(self, height_variance: Floats) -> list[FloorPrior | None]:
         floor = self.factors.floor
         if floor is None:
-            return [None] * len(rows)
-        points = self.beam_points(rows)
+            return [None] * len(self.frame)
         # an elevation of e raises the point by e times the range along the sonar's z axis
-        slope_m = self.frame.z[rows, 0] * self.view.world_z_by_elevation()
+        slope_m = self.frame.z[:, 0] * self.view.world_T_sonar.rotation().matrix()[2, 2]
         by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
-        variance = by_elevation + self.view.height_variances(points) + floor.sigma_m**2
+        variance = by_elevation + height_variance + floor.sigma_m**2
         # an object on a wall or a wreck must not be pulled to the floor
-        is_on_floor = np.square(points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
+        is_on_floor = np.square(self._points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
         return [floor if is_on else None for is_on in is_on_floor.tolist()]
 
 

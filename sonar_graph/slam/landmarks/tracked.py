@@ -150,15 +150,13 @@ class TrackedIdentities(IdentityPolicy):
         }
         refusals = second_rows_of_tracks(frame, known)
         # the second rows are left out before a landmark is given to the most probable row of the frame
-        kept = np.array([why is None for why in refusals])
+        kept = [row for row, why in enumerate(refusals) if why is None]
         _, outcomes = identify(
-            frame if kept.all() else frame.rows(kept),
+            frame if len(kept) == len(refusals) else frame.rows(np.array(kept)),
             self._minimum_probability,
             are_sound=True,
         )
-        for row, number in zip(
-            np.flatnonzero(kept).tolist(), outcomes.tolist(), strict=True
-        ):
+        for row, number in zip(kept, outcomes.tolist(), strict=True):
             refusals[row] = None if number == ACCEPTED else OUTCOMES[number]
         return refusals
 
@@ -169,9 +167,9 @@ class TrackedIdentities(IdentityPolicy):
         in its frame.
         """
         self._claims = []
-        tracked = (
-            None if frame is None else frame.select(frame.detections.track != NO_TRACK)
-        )
+        if frame is None:
+            return UNCHANGED
+        tracked = frame.select([track != NO_TRACK for track in frame.tracks])
         if tracked is None:
             return UNCHANGED
         given_up = self.forget(tracked.stamp_ns)
@@ -240,7 +238,7 @@ class TrackedIdentities(IdentityPolicy):
                     sighting, Outcome.REPEATED if is_repeated else Outcome.WAITING
                 )
             )
-        track_of = dict(zip(frame.rows, frame.detections.track.tolist(), strict=True))
+        track_of = dict(zip(frame.rows, frame.tracks, strict=True))
         for each in judged:
             track = self._tracks.get(track_of[each.sighting.row])
             if track is None:  # a single detection: final
@@ -386,12 +384,11 @@ class TrackedIdentities(IdentityPolicy):
         landmarks = np.array([self.smoother.estimates.atPoint3(key) for key in keys])
         compared = seen.view.compare(keys, landmarks, frame.z[rows], frame.noise[rows])
         # a sighting of a track may change its landmark, so that its noise must not depend on one
-        is_tracked = frame.detections.track[rows] != NO_TRACK
-        points = (
-            np.where(is_tracked[:, None], seen.beam_points(rows), landmarks)
-            if is_tracked.any()
-            else landmarks
-        )
+        points = landmarks
+        is_tracked = [frame.tracks[row] != NO_TRACK for row in rows]
+        if any(is_tracked):
+            mask = np.array(is_tracked)[:, None]
+            points = np.where(mask, seen.beam_points(rows), landmarks)
         judged = []
         for k, sighting in enumerate(seen.sightings(rows, points)):
             squared = float(compared.distance[k])
@@ -419,11 +416,11 @@ class TrackedIdentities(IdentityPolicy):
         frame = seen.frame
         z = frame.z[row]
         elevation_rad = seen.factors.elevation_on(
-            seen.floors_under([row])[0], seen.view.world_T_sonar, z
+            seen.floors[row], seen.view.world_T_sonar, z
         )
         start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
         # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
-        if frame.detections.track[row] == NO_TRACK:
+        if frame.tracks[row] == NO_TRACK:
             (sighting,) = seen.sightings([row], start[None], elevation_rad)
         else:
             (sighting,) = seen.sightings([row], seen.beam_points([row]))

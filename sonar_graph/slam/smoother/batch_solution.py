@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import gtsam
 import numpy as np
 
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.slam.smoother.factor_store import (
     Known,
     Sightlines,
@@ -297,7 +297,13 @@ class JointCovariance:
         for key in keys:
             rows[key] = n
             n += tangent_size(key)
-        return cls(marginals.jointMarginalCovariance(keys).fullMatrix(), rows)
+        # in the layout for which compiled code exists
+        joint = marginals.jointMarginalCovariance(keys).fullMatrix()
+        return cls(np.ascontiguousarray(joint), rows)
+
+    def first_rows(self, keys: list[int]) -> Ints:
+        """First row of each variable, shape (len(keys),)."""
+        return np.array([self.rows[key] for key in keys])
 
     def at(self, a: int, b: int) -> Floats:
         """The block of two variables."""

@@ -6,7 +6,7 @@ factors, or bias where they have none; marginals contain its information then.
 """
 
 from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -116,15 +116,14 @@ class SonarViews(NamedTuple):
 
 def sighted_from(values: Known, lines: Sequence[Sightline]) -> SonarViews:
     """Sightings from where keyframes are estimated."""
-    R = np.empty((len(lines), 3, 3))
-    t = np.empty((len(lines), 3))
-    z = np.empty((len(lines), 2))
-    for k, line in enumerate(lines):
-        world_T_sonar = values.atPose3(line.pose_key).compose(line.body_T_sonar)
-        R[k] = world_T_sonar.rotation().matrix()
-        t[k] = world_T_sonar.translation()
-        z[k] = line.z
-    return SonarViews(R, t, z)
+    world_T_sonar = np.array(
+        [
+            values.atPose3(line.pose_key).compose(line.body_T_sonar).matrix()
+            for line in lines
+        ]
+    ).reshape(-1, 4, 4)
+    z = np.array([line.z for line in lines]).reshape(-1, 2)
+    return SonarViews(world_T_sonar[:, :3, :3], world_T_sonar[:, :3, 3], z)
 
 
 def missed(sighted: SonarViews, landmark: Floats) -> tuple[int, Floats]:
@@ -144,13 +143,34 @@ Sightlines = Mapping[int, Sequence[Sightline]]
 """Sightings that have become factors, by landmark's key."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
 class FactorGroup:
-    """Factors that are used together or not at all, such as those of one sighting."""
+    """Factors that are used together or not at all, such as those of one sighting.
 
-    factors: Factors
-    seen: tuple[int, Sightline] | None = None
-    """Of a sighting: the key of its landmark, and where that was seen from."""
+    Parameters
+    ----------
+    factors
+        The factors, or a function that makes them, which is called when they are first needed: to make the factors of
+        many sightings in a row, at an update, is faster than to make those of each frame.
+    seen
+        Of a sighting: the key of its landmark, and where that was seen from.
+    """
+
+    __slots__ = ("_factors", "seen")
+
+    def __init__(
+        self,
+        factors: Factors | Callable[[], Factors],
+        seen: tuple[int, Sightline] | None = None,
+    ) -> None:
+        self._factors = factors
+        self.seen = seen
+
+    @property
+    def factors(self) -> Factors:
+        """Factors by their labels."""
+        if not isinstance(self._factors, dict):
+            self._factors = self._factors()
+        return self._factors
 
     def __iter__(self) -> Iterator[gtsam.NonlinearFactor]:
         return iter(self.factors.values())
@@ -162,8 +182,7 @@ class FactorStore:
     def __init__(self) -> None:
         self.new: dict[int, FactorGroup] = {}
         """Groups that the window has not taken up yet, by handle."""
-        self.new_graph = gtsam.NonlinearFactorGraph()
-        """Their factors."""
+        self._new_graph: gtsam.NonlinearFactorGraph | None = None
         self.gone: set[gtsam.NonlinearFactor] = set()
         """Factors that were taken out since the window took up the others."""
         self.groups: dict[int, FactorGroup] = {}
@@ -177,8 +196,7 @@ class FactorStore:
         """Handle of a new group."""
         handle, self._next = self._next, self._next + 1
         self.groups[handle] = self.new[handle] = group
-        for factor in group:
-            self.new_graph.add(factor)
+        self._new_graph = None
         if group.seen is not None:
             # most groups are sightings: do not search the keys of their factors
             landmark_key, line = group.seen
@@ -194,6 +212,13 @@ class FactorStore:
             self._leaving_with[min(lasting)].append(handle)
         return handle
 
+    @property
+    def new_graph(self) -> gtsam.NonlinearFactorGraph:
+        """Factors of the new groups."""
+        if self._new_graph is None:
+            self._new_graph = graph_of(self.new.values())
+        return self._new_graph
+
     def remove(self, handles: Iterable[int]) -> None:
         """Take groups out."""
         for handle in handles:
@@ -201,8 +226,7 @@ class FactorStore:
             group = self.groups.pop(handle)
             self.gone.update(group)
             self._drop_line(handle, group)
-        # GTSAM's graph would keep a hole
-        self.new_graph = graph_of(self.new.values())
+        self._new_graph = None
 
     def leave(self, keys: Iterable[int]) -> list[int]:
         """Drop the groups that leave with these variables; their handles."""
@@ -221,7 +245,9 @@ class FactorStore:
 
     def take_up(self) -> None:
         """The window has taken up what was new, and let go of what is gone."""
-        self.new, self.gone, self.new_graph = {}, set(), gtsam.NonlinearFactorGraph()
+        self.new = {}
+        self.gone = set()
+        self._new_graph = None
 
     def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
         """Factors of some groups."""
@@ -259,6 +285,6 @@ def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:
     """Graph of the factors of some groups, in their order."""
     graph = gtsam.NonlinearFactorGraph()
     for group in groups:
-        for factor in group:
+        for factor in group.factors.values():
             graph.add(factor)
     return graph

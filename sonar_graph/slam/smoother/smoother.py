@@ -34,7 +34,6 @@ from sonar_graph.slam.smoother.factor_store import (
     FactorGroup,
     Factors,
     FactorStore,
-    Sightline,
     is_pose,
     picked,
     variable_name,
@@ -187,18 +186,6 @@ class Estimates:
         """True for a variable that is in the window, not only about to be."""
         return self.exists(key) and not self.new.exists(key)
 
-    def atPose3(self, key: int) -> gtsam.Pose3:
-        """Pose of a keyframe; the name is GTSAM's."""
-        return self._at(key)
-
-    def atPoint3(self, key: int) -> Floats:
-        """Position of a landmark; the name is GTSAM's."""
-        return self._at(key)
-
-    def atVector(self, key: int) -> Floats:
-        """Biases; the name is GTSAM's."""
-        return self._at(key)
-
     def _at(self, key: int) -> Any:
         # a frame uses the same few variables several times
         known = self._known.get(key)
@@ -209,6 +196,13 @@ class Estimates:
             known = source.atPose3(key) if is_pose(key) else source.atVector(key)
             self._known[key] = known
         return known
+
+    atPose3 = _at
+    """Pose of a keyframe; these names are GTSAM's."""
+    atPoint3 = _at
+    """Position of a landmark."""
+    atVector = _at
+    """Biases."""
 
     def all(self) -> gtsam.Values:
         """All variables, as a copy."""
@@ -266,6 +260,8 @@ class Smoother:
         self._times_s: dict[int, float] = {}
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
+        self._in_reach: list[int] = []
+        """Landmarks in reach at the last step."""
         self._newest_bias: int | None = None
         self._refused: set[int] = set()
         self._left: set[int] = set()
@@ -353,22 +349,23 @@ class Smoother:
 
     def add(
         self,
-        factors: Factors,
-        seen: tuple[int, Sightline] | None = None,
+        factors: Factors | FactorGroup,
         *,
         gain: float = 0.0,
     ) -> int:
-        """Add factors that are used together or not at all (`FactorGroup`), at the next update; returns their handle.
+        """Add factors that are used together or not at all, at the next update; returns their handle.
 
         ``gain``: expected information, predicted variance over noise variance.
         """
+        group = factors if isinstance(factors, FactorGroup) else FactorGroup(factors)
         self._waiting_gain += gain
         # the batch solution lacks these factors
         self._solved = None
-        if seen is not None:
+        if group.seen is not None:
             # stands for the range of the sonar, which the calibration does not contain
-            self._longest_range_m = max(self._longest_range_m, float(seen[1].z[0]))
-        return self._store.add(FactorGroup(factors, seen))
+            range_m = float(group.seen[1].z[0])
+            self._longest_range_m = max(self._longest_range_m, range_m)
+        return self._store.add(group)
 
     def hold(self, until_s: dict[int, float]) -> None:
         """Keep these keyframes, and all later ones, in a bounded window until the given times."""
@@ -420,7 +417,7 @@ class Smoother:
         self._forget(lost_landmarks)
         for key, point in (new_landmarks or {}).items():
             self.add_landmark(key, point)
-        handles = [self.add(group.factors, group.seen) for group in added]
+        handles = [self.add(group) for group in added]
         self._withhold_unusable()
         if lost_landmarks and self.is_bounded:
             # GTSAM's fixed-lag smoother keeps a variable that lost its factors: begin again without it
@@ -504,6 +501,7 @@ class Smoother:
         """One Gauss-Newton step of the window; False where it failed, and the window was restarted."""
         window = self._window
         store = self._store
+        self._in_reach = self._landmarks_in_reach()
         try:
             if isinstance(window, WholeWindow):
                 window.update(
@@ -711,9 +709,7 @@ class Smoother:
 
     def _likely(self) -> list[int]:
         """Landmarks in the window that the next frame may show."""
-        return [
-            key for key in self._landmarks_in_reach() if self.estimates.is_taken_up(key)
-        ]
+        return [key for key in self._in_reach if self.estimates.is_taken_up(key)]
 
     def _asked_next(self) -> list[int]:
         """Variables whose covariance is needed next: newest keyframe and biases, and landmarks in reach."""
@@ -721,7 +717,7 @@ class Smoother:
         newest = [
             key for key in (self._newest_pose, self._newest_bias) if key is not None
         ]
-        return self.in_window(newest) + self._landmarks_in_reach()
+        return self.in_window(newest) + self._in_reach
 
     def _landmarks_in_reach(self) -> list[int]:
         """Landmarks within `REACH` times the longest range measured so far from the newest keyframe."""
@@ -729,15 +725,17 @@ class Smoother:
             return []
         reach_m = REACH * self._longest_range_m
         new = self.estimates.new
+        new_keys = set(new.keys())
         # within the relinearisation threshold of the estimate, and known without back-substitution
         linearised_at = self._window.linearised_at
         position_m = self.estimates.atPose3(self._newest_pose).translation()
         points_m = [
-            (new if new.exists(key) else linearised_at).atPoint3(key)
+            (new if key in new_keys else linearised_at).atPoint3(key)
             for key in self._landmarks
         ]
-        distances_m = np.linalg.norm(np.array(points_m) - position_m, axis=1)
-        return list(compress(self._landmarks, (distances_m <= reach_m).tolist()))
+        d = np.array(points_m) - position_m
+        is_near = np.vecdot(d, d) <= reach_m**2
+        return list(compress(self._landmarks, is_near.tolist()))
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables, from the batch solution if one has left the window."""

@@ -125,7 +125,7 @@ def factors_of(part: Groups) -> list[gtsam.NonlinearFactor]:
     groups = list(part.values())
     seen = groups[0].seen
     if len(groups) == 1 or seen is None:
-        return list(groups[0])
+        return list(groups[0].factors.values())
     landmark_key, line = seen
     error = BundleError((line.pose_key, landmark_key), groups)
     noise = gtsam.noiseModel.Unit.Create(error.rows)
@@ -186,9 +186,10 @@ class WholeWindow:
         params.force_relinearize = relinearises
         groups = gtsam.KeyGroupMap()
         eliminated_again = gtsam.KeyList()
+        new_keys = set(values.keys())
         for key in last:
             groups.insert2(key, LAST)
-            if not values.exists(key):
+            if key not in new_keys:
                 # GTSAM orders only what it eliminates
                 eliminated_again.push_back(key)
         params.constrainedKeys = groups
