@@ -44,12 +44,11 @@ from sonar_graph.diagnosis.findings import (
     unused,
 )
 from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
-from sonar_graph.diagnosis.sightings import sighting_changes
+from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     STEP_RATIO,
     Match,
-    SignalStretch,
     Values,
     explained,
     match,
@@ -260,22 +259,28 @@ def sighting_match(
     is_mirrored = signs[-1.0][1].scatter < signs[1.0][1].scatter / CLEARLY_BETTER
     changes, by_azimuth = signs[-1.0 if is_mirrored else 1.0]
     if of_range:
-        return range_match(changes.range)
+        aperture_rad = sequence.calibration.sonar.elevation_aperture_rad
+        return range_match(changes, aperture_rad)
     # a delay turns landmarks about the vehicle as fast as it turns, not as changes of the azimuth change
     turn_rate = root_mean_square([np.diff(motion.yaw_rad) / np.diff(motion.seconds)])
     return replace(by_azimuth, is_mirrored=is_mirrored, rate=turn_rate)
 
 
-def range_match(changes: SignalStretch) -> Match:
-    """Changes of ranges by the motion, beside what heights of landmarks take off them."""
-    found = replace(match([changes], find_lag=False), stretches=(changes,))
+def range_match(changes: SightingChanges, aperture_rad: float) -> Match:
+    """Changes of ranges by the motion, beside what heights of landmarks take off them.
+
+    Elevations are not measured, but lie within the aperture, with a sigma of ``aperture / sqrt(12)``.
+    """
+    whole = changes.range
+    found = replace(match([whole], find_lag=False), stretches=(whole,))
+    of_elevation = aperture_rad / float(np.sqrt(12.0)) * changes.error_by_elevation
     by_scale = explained(found.stretches, of_scale, 1)
     if by_scale is None or not found.gain.is_known:
         return found
     beside_heights = Estimate1D(1.0 + float(by_scale.q[0]), float(by_scale.sigmas[0]))
     # where ranges change little, a scale and heights look alike: the nearer to 1 of both readings is sure
     gain = min(found.gain, beside_heights, key=lambda one: abs(one.value - 1.0))
-    return replace(found, gain=gain)
+    return replace(found, gain=gain).less_certain(of_elevation)
 
 
 DEPTH = Check(
