@@ -734,8 +734,13 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     if np.count_nonzero(inside) < NEAR_START:
         return
     by_depth = np.interp(fixes.stamps_ns[inside], depth.stamps_ns, depth.z_m)
-    off_m = float(np.median(fixes.position_m[inside, 2] - by_depth))
+    off = fixes.position_m[inside, 2] - by_depth
+    off_m = float(np.median(off))
     sigma_m = sequence.calibration.positions.sigma_m[2]
+    # the calibration's counts where the log has none
+    if np.isfinite(heights_m2[inside]).all():
+        sigma_m = float(np.sqrt(np.median(heights_m2[inside])))
+    sigma_m = max(sigma_m, float(np.median(np.abs(off - off_m))))
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
     cause = (

@@ -19,6 +19,8 @@ from sonar_graph.diagnosis.aiding_check import (
     CHECKS,
     DEPTH,
     HEADING,
+    MOST_MISFIT,
+    OTHER_UNIT,
     POSITIONS,
     RANGE,
     VERTICAL_BIAS,
@@ -30,7 +32,12 @@ from sonar_graph.diagnosis.aiding_check import (
     start_heading_findings,
     vertical_bias,
 )
-from sonar_graph.diagnosis.axes import AxesMatch, match_axes, turns_less_than_body
+from sonar_graph.diagnosis.axes import (
+    AxesMatch,
+    is_of_force,
+    match_axes,
+    turns_less_than_body,
+)
 from sonar_graph.diagnosis.causes import PITCH, pitched_one, velocity_steps
 from sonar_graph.diagnosis.findings import (
     ALSO,
@@ -438,10 +445,9 @@ def axes_findings(
         cause = f"{CONTRADICTED}, and no axes fit clearly better"
         return [no_axes_finding(ANY_AXES, cause)], sequence
     findings = list[Finding]()
-    # gyros and Doppler log agree with each other: rates are reflected the other way
-    is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
     # gravity is felt upwards: of the accelerometers only level axes can be wrong
-    is_force &= found.dvl[2, 2] == 1.0
+    is_level = found.dvl[2, 2] == 1.0
+    is_force = is_of_force(found.gyro, found.dvl) and is_level
     if is_force and (found.dvl != np.eye(3)).any():
         return force_axes(found, sequence, config)
     if (found.gyro != np.eye(3)).any():
@@ -604,10 +610,18 @@ def motion_findings(
     ]
     found = list[Finding]()
     # one of them may be mirrored; of two, the gyros are
+    rightly_turned = right
     if len(against_gyros) > 1:
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
-        right = scaled_gyros(right, Z_NEGATED)
+        rightly_turned = scaled_gyros(right, Z_NEGATED)
+    elif turned := matches[HEADING]:
+        gain = shared_gyro_scale(right, turned)
+        if gain is not None:
+            found += findings_of(HEADING, turned, right, config)
+            rightly_turned = scaled_gyros(right, gain * np.eye(3))
+    if rightly_turned is not right:
+        right = rightly_turned
         motion = BodyMotion.of(right)
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
@@ -626,7 +640,12 @@ def motion_findings(
         )
         if match is not None and not is_range_wrong:
             found += findings_of(check, match, right, config)
-    of_heading = list(heading_findings(matches[HEADING], right, config, motion))
+    named = {f.quantity for f in found}
+    of_heading = [
+        f
+        for f in heading_findings(matches[HEADING], right, config, motion)
+        if f.quantity not in named
+    ]
     is_heading_wrong = any(
         f.quantity == HEADING.quantity and f.acts for f in of_heading
     )
@@ -645,6 +664,22 @@ def motion_findings(
     if not any(f.grave for f in found):
         found += start_place_findings(right, motion)
     return found
+
+
+def shared_gyro_scale(right: Sequence, of_heading: Match) -> float | None:
+    """Factor by which heading and another sensor turn more than the gyros; None where only the heading does, or nothing."""
+    gain = of_heading.gain
+    if of_heading.misfit >= MOST_MISFIT or not gain.is_known:
+        return None
+    is_scale = 1 / OTHER_UNIT < gain.value < OTHER_UNIT
+    if not is_scale or not matters(gain.minus(1.0), HEADING.least_scale):
+        return None
+    scaled = scaled_gyros(right, gain.value * np.eye(3))
+    if brought_apart(right, scaled):
+        return None
+    nearer = brought_apart(scaled, right)
+    is_shared = AZIMUTH.name in nearer or POSITIONS.name in nearer
+    return gain.value if is_shared else None
 
 
 def dvl_findings(
