@@ -329,10 +329,8 @@ POSITIONS = Check(
     role="positions",
     against="the path by gyros and Doppler log",
     compare=fix_match,
-    sigma=lambda sequence: level_sigma_m(sequence.calibration.positions.sigma_m),
-    slow_sigma=lambda sequence: (
-        0.1 * level_sigma_m(sequence.calibration.positions.sigma_m)
-    ),
+    sigma=lambda sequence: level_sigma_m(fix_sigma_m(sequence)),
+    slow_sigma=lambda sequence: 0.1 * level_sigma_m(fix_sigma_m(sequence)),
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda config: Advice(
         "north and east are exchanged",
@@ -405,6 +403,20 @@ def typical_sighting(sequence: Sequence) -> tuple[float, float]:
         for values in (seen.range_m, seen.azimuth_rad)
     ]
     return float(np.sqrt(mean_squares[0])), float(np.sqrt(mean_squares[1]))
+
+
+def fix_sigma_m(sequence: Sequence) -> tuple[float, float, float]:
+    """Typical standard deviations of a fix along the world's axes: the log's, or the calibration's where it has none."""
+    known = sequence.positions
+    if known is not None:
+        variances = np.einsum("nii->ni", known.covariance_m2)
+        variances = variances[known.are_sound() & np.isfinite(variances).all(axis=1)]
+        # a coordinate that is not measured says nothing of those that are
+        measured = np.where(variances < 0.5 * UNMEASURED_M2, variances, np.nan)
+        if np.isfinite(measured).any(axis=0).all():
+            x, y, z = np.sqrt(np.nanmedian(measured, axis=0)).tolist()
+            return x, y, z
+    return sequence.calibration.positions.sigma_m
 
 
 def level_sigma_m(sigma_m: tuple[float, float, float]) -> float:
@@ -736,11 +748,7 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     by_depth = np.interp(fixes.stamps_ns[inside], depth.stamps_ns, depth.z_m)
     off = fixes.position_m[inside, 2] - by_depth
     off_m = float(np.median(off))
-    sigma_m = sequence.calibration.positions.sigma_m[2]
-    # the calibration's counts where the log has none
-    if np.isfinite(heights_m2[inside]).all():
-        sigma_m = float(np.sqrt(np.median(heights_m2[inside])))
-    sigma_m = max(sigma_m, float(np.median(np.abs(off - off_m))))
+    sigma_m = max(fix_sigma_m(sequence)[2], float(np.median(np.abs(off - off_m))))
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
     cause = (
@@ -1016,7 +1024,7 @@ def led_to_fixes(
     way = float(np.median(np.abs(moved[inside])))
     antenna_m = float(np.hypot(*right.calibration.positions.antenna_m[:2]))
     parts = (
-        level_sigma_m(right.calibration.positions.sigma_m) / 2,
+        level_sigma_m(fix_sigma_m(right)) / 2,
         level_sigma_m(start.position_sigma_m),
         way * start.rpy_sigma_rad[2],
         antenna_m,
@@ -1033,7 +1041,7 @@ def distance_finding(
     """
     calibration = right.calibration
     start = calibration.start
-    noise_m = level_sigma_m(calibration.positions.sigma_m)
+    noise_m = level_sigma_m(fix_sigma_m(right))
     start_m = level_sigma_m(start.position_sigma_m)
     order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
     near = np.median(fixes.position_m[order], axis=0)

@@ -8,6 +8,7 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -56,6 +57,7 @@ from sonar_graph.diagnosis.findings import (
     shift_line,
     signed_axes,
     unknown,
+    unused,
     with_interval,
     worst_first,
 )
@@ -615,11 +617,10 @@ def motion_findings(
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
         rightly_turned = scaled_gyros(right, Z_NEGATED)
-    elif turned := matches[HEADING]:
-        gain = shared_gyro_scale(right, turned)
-        if gain is not None:
-            found += findings_of(HEADING, turned, right, config)
-            rightly_turned = scaled_gyros(right, gain * np.eye(3))
+    scale = HeadingScale.of(rightly_turned, matches[HEADING])
+    if scale and scale.is_shared and rightly_turned is right:
+        found += heading_findings(matches[HEADING], right, config, motion)
+        rightly_turned = scaled_gyros(right, scale.gain * np.eye(3))
     if rightly_turned is not right:
         right = rightly_turned
         motion = BodyMotion.of(right)
@@ -646,6 +647,8 @@ def motion_findings(
         for f in heading_findings(matches[HEADING], right, config, motion)
         if f.quantity not in named
     ]
+    if scale is not None:
+        of_heading = [scale.judged(f) for f in of_heading]
     is_heading_wrong = any(
         f.quantity == HEADING.quantity and f.acts for f in of_heading
     )
@@ -666,20 +669,36 @@ def motion_findings(
     return found
 
 
-def shared_gyro_scale(right: Sequence, of_heading: Match) -> float | None:
-    """Factor by which heading and another sensor turn more than the gyros; None where only the heading does, or nothing."""
-    gain = of_heading.gain
-    if of_heading.misfit >= MOST_MISFIT or not gain.is_known:
-        return None
-    is_scale = 1 / OTHER_UNIT < gain.value < OTHER_UNIT
-    if not is_scale or not matters(gain.minus(1.0), HEADING.least_scale):
-        return None
-    scaled = scaled_gyros(right, gain.value * np.eye(3))
-    if brought_apart(right, scaled):
-        return None
-    nearer = brought_apart(scaled, right)
-    is_shared = AZIMUTH.name in nearer or POSITIONS.name in nearer
-    return gain.value if is_shared else None
+class HeadingScale(NamedTuple):
+    """Scale of the heading over the gyros, and what other sensors make of gyros that are scaled by as much."""
+
+    gain: float
+    apart: str
+    """Names of sensors that agree with such gyros less; empty without any."""
+    is_shared: bool
+    """True where azimuths or fixes agree with them better, and no sensor less: the gyros are wrong."""
+
+    @classmethod
+    def of(cls, right: Sequence, of_heading: Match | None) -> "HeadingScale | None":
+        """None where the heading turns as the gyros do, or not by a scale."""
+        if of_heading is None or of_heading.misfit >= MOST_MISFIT:
+            return None
+        gain = of_heading.gain
+        is_scale = 1 / OTHER_UNIT < gain.value < OTHER_UNIT
+        if not is_scale or not matters(gain.minus(1.0), HEADING.least_scale):
+            return None
+        scaled = scaled_gyros(right, gain.value * np.eye(3))
+        apart = brought_apart(right, scaled)
+        nearer = brought_apart(scaled, right)
+        by_others = AZIMUTH.name in nearer or POSITIONS.name in nearer
+        return cls(gain.value, apart, by_others and not apart)
+
+    def judged(self, finding: Finding) -> Finding:
+        """The row of the heading's scale, which is its own where other sensors agree with the gyros."""
+        if not (self.apart and finding.acts and finding.quantity == HEADING.quantity):
+            return finding
+        cause = f"the gyros fit {self.apart} as they are: the heading has a wrong scale, or deviates with its direction"
+        return replace(finding, cause=cause, line=unused(HEADING.role))
 
 
 def dvl_findings(

@@ -142,3 +142,12 @@ def test_velocities_in_axes_of_the_world_are_named_before_all_else(
     assert ratio > 2.0
     first, *_ = check_sensors(run, LogConfig())
     assert "axes of the world" in first.text()
+
+
+def test_rows_of_the_doppler_log_in_a_hole_of_the_imu_contradict_no_axes() -> None:
+    t = (WORLD.imu.stamps_ns - WORLD.imu.stamps_ns[0]) * 1e-9
+    imu = WORLD.imu.rows((t <= 30.0) | (t >= 55.0))
+    found = match_axes(imu, WORLD.dvl, WORLD.calibration)
+    assert found is not None
+    assert (found.gyro == IDENTITY).all()
+    assert (found.dvl == IDENTITY).all()
