@@ -259,6 +259,11 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
     if any(f.acts and f.quantity.endswith(PITCH.name) for f in by_motion):
         lever = [Finding(ARM, unknown("IMU or Doppler log is pitched"), "m")]
+    # gyros that are late against the forces look like an arm
+    angles = (HEADING.name, AZIMUTH.name)
+    delays = [f for f in by_motion if f.quantity.endswith(": delay") and f.acts]
+    if any(f.quantity.startswith(angles) for f in delays):
+        lever = [Finding(ARM, unknown("gyros or other sensors are late"), "m")]
     reference = list(reference_findings(right, config, tilt))
     if right.calibration.start.states("rpy_rad"):
         off = tilt.angle(1).minus(right.calibration.start.rpy_rad[1])
