@@ -97,6 +97,7 @@ from sonar_graph.logs import (
     FELT_ALONG,
     OTHER_WAYS,
     STEPPED_BACK,
+    TAKEN_AS_ZERO,
     axis_doubts,
     gravity_warning,
     row_notes,
@@ -166,7 +167,8 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     """
     # matrices are small: threads of BLAS would only wait for each other
     with threadpool_limits(1, user_api="blas"):
-        return worst_first(all_findings(sequence, config or LogConfig()))
+        findings = all_findings(sequence, config or LogConfig())
+    return worst_first([*unplaced_findings(sequence, findings), *findings])
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
@@ -295,6 +297,17 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         *of_map,
         *noise,
     ]
+
+
+def unplaced_findings(sequence: Sequence, findings: list[Finding]) -> Iterator[Finding]:
+    """Mountings that are not known, where sensors contradict each other: they come before all that may follow from them."""
+    warnings = sequence.notes.get("log.warnings", "").split("; ")
+    roles = [text.partition(":")[0] for text in warnings if TAKEN_AS_ZERO in text]
+    if roles and any(finding.grave for finding in findings):
+        names = ", ".join(roles)
+        cause = f"those of {names} are not in the log and count as zero, which may be all that is wrong"
+        line = f"give them {IN_CALIBRATION} first"
+        yield contradiction("mountings", cause, line, "not known")
 
 
 def spoilt_by(sequence: Sequence) -> str:
