@@ -123,7 +123,7 @@ def sighting_changes(
 
     changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     longer = seen.range_m[j] - seen.range_m[i]
-    climbed = height(t[j]) - height(t[i])
+    climbed = np.asarray(height(t[j]) - height(t[i]), np.float64)
     passage_of = np.stack([seen.most_probable()[0][i], t[j] // PASSAGE_S])
     passage = np.unique(passage_of, axis=1, return_inverse=True)[1].ravel()
     return SightingChanges(
