@@ -44,12 +44,11 @@ from sonar_graph.diagnosis.findings import (
     unused,
 )
 from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
-from sonar_graph.diagnosis.sightings import sighting_changes
+from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     STEP_RATIO,
     Match,
-    SignalStretch,
     Values,
     explained,
     match,
@@ -260,22 +259,28 @@ def sighting_match(
     is_mirrored = signs[-1.0][1].scatter < signs[1.0][1].scatter / CLEARLY_BETTER
     changes, by_azimuth = signs[-1.0 if is_mirrored else 1.0]
     if of_range:
-        return range_match(changes.range)
+        aperture_rad = sequence.calibration.sonar.elevation_aperture_rad
+        return range_match(changes, aperture_rad)
     # a delay turns landmarks about the vehicle as fast as it turns, not as changes of the azimuth change
     turn_rate = root_mean_square([np.diff(motion.yaw_rad) / np.diff(motion.seconds)])
     return replace(by_azimuth, is_mirrored=is_mirrored, rate=turn_rate)
 
 
-def range_match(changes: SignalStretch) -> Match:
-    """Changes of ranges by the motion, beside what heights of landmarks take off them."""
-    found = replace(match([changes], find_lag=False), stretches=(changes,))
+def range_match(changes: SightingChanges, aperture_rad: float) -> Match:
+    """Changes of ranges by the motion, beside what heights of landmarks take off them.
+
+    Elevations are not measured, but lie within the aperture, with a sigma of ``aperture / sqrt(12)``.
+    """
+    whole = changes.range
+    found = replace(match([whole], find_lag=False), stretches=(whole,))
+    of_elevation = aperture_rad / float(np.sqrt(12.0)) * changes.error_by_elevation
     by_scale = explained(found.stretches, of_scale, 1)
     if by_scale is None or not found.gain.is_known:
         return found
     beside_heights = Estimate1D(1.0 + float(by_scale.q[0]), float(by_scale.sigmas[0]))
     # where ranges change little, a scale and heights look alike: the nearer to 1 of both readings is sure
     gain = min(found.gain, beside_heights, key=lambda one: abs(one.value - 1.0))
-    return replace(found, gain=gain)
+    return replace(found, gain=gain).less_certain(of_elevation)
 
 
 DEPTH = Check(
@@ -324,10 +329,8 @@ POSITIONS = Check(
     role="positions",
     against="the path by gyros and Doppler log",
     compare=fix_match,
-    sigma=lambda sequence: level_sigma_m(sequence.calibration.positions.sigma_m),
-    slow_sigma=lambda sequence: (
-        0.1 * level_sigma_m(sequence.calibration.positions.sigma_m)
-    ),
+    sigma=lambda sequence: level_sigma_m(fix_sigma_m(sequence)),
+    slow_sigma=lambda sequence: 0.1 * level_sigma_m(fix_sigma_m(sequence)),
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda config: Advice(
         "north and east are exchanged",
@@ -400,6 +403,20 @@ def typical_sighting(sequence: Sequence) -> tuple[float, float]:
         for values in (seen.range_m, seen.azimuth_rad)
     ]
     return float(np.sqrt(mean_squares[0])), float(np.sqrt(mean_squares[1]))
+
+
+def fix_sigma_m(sequence: Sequence) -> tuple[float, float, float]:
+    """Typical standard deviations of a fix along the world's axes: the log's, or the calibration's where it has none."""
+    known = sequence.positions
+    if known is not None:
+        variances = np.einsum("nii->ni", known.covariance_m2)
+        variances = variances[known.are_sound() & np.isfinite(variances).all(axis=1)]
+        # a coordinate that is not measured says nothing of those that are
+        measured = np.where(variances < 0.5 * UNMEASURED_M2, variances, np.nan)
+        if np.isfinite(measured).any(axis=0).all():
+            x, y, z = np.sqrt(np.nanmedian(measured, axis=0)).tolist()
+            return x, y, z
+    return sequence.calibration.positions.sigma_m
 
 
 def level_sigma_m(sigma_m: tuple[float, float, float]) -> float:
@@ -729,8 +746,9 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     if np.count_nonzero(inside) < NEAR_START:
         return
     by_depth = np.interp(fixes.stamps_ns[inside], depth.stamps_ns, depth.z_m)
-    off_m = float(np.median(fixes.position_m[inside, 2] - by_depth))
-    sigma_m = sequence.calibration.positions.sigma_m[2]
+    off = fixes.position_m[inside, 2] - by_depth
+    off_m = float(np.median(off))
+    sigma_m = max(fix_sigma_m(sequence)[2], float(np.median(np.abs(off - off_m))))
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
     cause = (
@@ -1006,7 +1024,7 @@ def led_to_fixes(
     way = float(np.median(np.abs(moved[inside])))
     antenna_m = float(np.hypot(*right.calibration.positions.antenna_m[:2]))
     parts = (
-        level_sigma_m(right.calibration.positions.sigma_m) / 2,
+        level_sigma_m(fix_sigma_m(right)) / 2,
         level_sigma_m(start.position_sigma_m),
         way * start.rpy_sigma_rad[2],
         antenna_m,
@@ -1023,7 +1041,7 @@ def distance_finding(
     """
     calibration = right.calibration
     start = calibration.start
-    noise_m = level_sigma_m(calibration.positions.sigma_m)
+    noise_m = level_sigma_m(fix_sigma_m(right))
     start_m = level_sigma_m(start.position_sigma_m)
     order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
     near = np.median(fixes.position_m[order], axis=0)

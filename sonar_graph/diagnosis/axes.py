@@ -11,7 +11,7 @@ Doppler log measures, so that the two differ where the vehicle turns and moves.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.devices import is_partial
+from sonar_graph.diagnosis.motion_signals import holes_beside
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     cross_matrices,
-    holes_before,
     means_over,
     stretches_of,
 )
@@ -48,6 +48,8 @@ LEAST_FREEDOM = 27
 """Three differences for each entry of a matrix that is no permutation."""
 MOST_LEFT = 1.6
 """Largest ratio of the sum of squares at the best candidate and with any matrix: beyond it no candidate fits."""
+SMALL_SHARE = 0.01
+"""Or the share of the squares that any matrix explains and the best candidate does not: a tenth of a velocity is a scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +94,22 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     ones = np.ones((len(candidates), 1))
     entries = np.hstack([ones, candidates.reshape(-1, 9)])  # (48, 10)
     squares = np.empty((48, 48))
-    least = np.empty(48)
+    least = np.empty((48, 48))
     for k, G in enumerate(candidates):
         Q = rows.quadratic_form(G)
         squares[k] = np.einsum("ki,ij,kj->k", entries, Q, entries)
         least[k] = least_of(Q)
+    if squares[0, 0] > LEAST_RATIO * squares.min():
+        with_force_axes(rows, candidates, squares, least)
     best = squares.min()
     variance = best / rows.freedom
     is_better = squares[0, 0] - best > LEAST_GAIN * variance
     is_clear = squares[0, 0] > LEAST_RATIO * best
-    is_fit = best <= MOST_LEFT * least[squares.min(axis=1).argmin()]
+    least_left = least.flat[squares.argmin()]
+    # what any matrix explains, and how much of it the best candidate does not
+    explained = squares[0, 0] - least_left
+    is_fit = best <= MOST_LEFT * least_left
+    is_fit |= best - least_left <= SMALL_SHARE * explained
     if not (is_better and is_clear and is_fit):
         right_handed = candidates[handed > 0]
         return other_matrix(rows, right_handed[squares[0, handed > 0].argmin()])
@@ -120,6 +128,28 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     is_sure = not any((rival == other).all() for rival in rivals)
     ratio = float(np.sqrt(squares[0, 0] / squares[g, p]))
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
+
+
+def with_force_axes(
+    rows: "SharedRows", candidates: Floats, squares: Floats, least: Floats
+) -> None:
+    """Put in the sums of squares of candidates that stand for other axes of the accelerometers, shapes (48, 48).
+
+    Rates and velocities that change together, ``G = det(P) P``, are right, and so is the arm: ``P (v - w x l)`` is the
+    velocity at the IMU in the axes of the accelerometers.
+    """
+    at_imu = rows.at_imu()
+    for k in np.flatnonzero(np.linalg.det(candidates) > 0).tolist():
+        Q = at_imu.quadratic_form(candidates[k])
+        for j, P in enumerate(candidates):
+            if is_of_force(candidates[k], P):
+                squares[k, j] = square_of(Q, P)
+                least[k, j] = least_of(Q)
+
+
+def is_of_force(gyro: Floats, dvl: Floats) -> bool:
+    """True where gyros and Doppler log agree with each other: rates are reflected the other way than velocities."""
+    return bool((gyro == np.linalg.det(dvl) * dvl).all())
 
 
 def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
@@ -229,13 +259,15 @@ class SharedRows:
         t = (dvl.stamps_ns - stamps_ns[0]) * 1e-9
         inside = (t >= 0) & (t <= imu_s[-1]) & ~is_partial(dvl.velocity_cov)
         inside[1:] &= np.diff(t) > 0
+        holes, until = holes_beside(stamps_ns, imu_s, t)
+        # in a hole of the IMU nothing is known of the motion
+        inside &= holes == until
         if not inside.any():
             return None
         # a choice among a few axes needs no more, and costs with the length
         inside &= np.abs(t - np.median(t[inside])) <= LONGEST_S / 2
         t = t[inside]
-        holes = holes_before(stamps_ns)[np.searchsorted(imu_s, t, side="right") - 1]
-        runs = list(runs_of(t, holes))
+        runs = list(runs_of(t, holes[inside]))
         if not runs:
             return None
         # rows of the Doppler log are among the ends of the steps, so that nothing is interpolated
@@ -258,6 +290,11 @@ class SharedRows:
             ),
             runs,
         )
+
+    def at_imu(self) -> "SharedRows":
+        """The same with the velocities of the IMU's place, and no arm."""
+        moved = self.velocity - np.cross(self.rate, self.lever)
+        return replace(self, velocity=moved, lever=np.zeros(3))
 
     @property
     def freedom(self) -> int:

@@ -22,7 +22,7 @@ from sonar_graph.diagnosis.findings import (
     numbers,
     unused,
 )
-from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.motion_signals import BodyMotion, holes_beside
 from sonar_graph.diagnosis.signals import (
     Explained,
     Match,
@@ -291,8 +291,14 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
     felt = motion.felt
     gravity = felt.gravity_m_s2 - residual(motion, felt.gravity_m_s2)  # (n, 3)
     texts = list[str]()
-    for part in np.unique(motion.parts):
-        rows = np.flatnonzero(motion.parts == part)
+    # nothing is felt in holes of the accelerometers
+    imu = sequence.imu
+    is_felt = np.isfinite(imu.specific_force).all(axis=1)
+    felt_s = motion.since_origin(imu.stamps_ns[is_felt])
+    before, after = holes_beside(imu.stamps_ns[is_felt], felt_s, motion.seconds)
+    parts = motion.parts + before
+    for part in np.unique(parts):
+        rows = np.flatnonzero((parts == part) & (before == after))
         t = motion.seconds[rows]
         by_forces = felt.impulse_m_s[rows] - running_integral(t, gravity[rows])
         # a wrong unit of velocities was found before

@@ -18,7 +18,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis.signals import SignalStretch, Values, root_mean_square
 from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
-from sonar_graph.navigation.alignment import InertialPath
+from sonar_graph.navigation.alignment import InertialPath, holes_before
 from sonar_graph.numerics import columns_at, running_integral
 from sonar_graph.sequence import Sequence
 
@@ -190,6 +190,18 @@ class BodyMotion:
                 if len(rows) >= FEWEST_ROWS
             ]
         return found
+
+
+def holes_beside(stamps_ns: Ints, seconds: Floats, at: Floats) -> tuple[Ints, Ints]:
+    """Number of holes until the sample before each instant, and the one after it, shape (k,); in a hole they differ.
+
+    ``stamps_ns`` and ``seconds``: the samples' stamps, also on the axis of the instants.
+    """
+    holes = holes_before(stamps_ns)
+    before = np.searchsorted(seconds, at, side="right") - 1
+    after = np.searchsorted(seconds, at)
+    last = len(holes) - 1
+    return holes[np.maximum(before, 0)], holes[np.minimum(after, last)]
 
 
 def filled(values: Floats) -> Floats:

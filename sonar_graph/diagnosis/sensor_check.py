@@ -8,6 +8,7 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -19,6 +20,8 @@ from sonar_graph.diagnosis.aiding_check import (
     CHECKS,
     DEPTH,
     HEADING,
+    MOST_MISFIT,
+    OTHER_UNIT,
     POSITIONS,
     RANGE,
     VERTICAL_BIAS,
@@ -30,7 +33,12 @@ from sonar_graph.diagnosis.aiding_check import (
     start_heading_findings,
     vertical_bias,
 )
-from sonar_graph.diagnosis.axes import AxesMatch, match_axes, turns_less_than_body
+from sonar_graph.diagnosis.axes import (
+    AxesMatch,
+    is_of_force,
+    match_axes,
+    turns_less_than_body,
+)
 from sonar_graph.diagnosis.causes import PITCH, pitched_one, velocity_steps
 from sonar_graph.diagnosis.findings import (
     ALSO,
@@ -49,6 +57,7 @@ from sonar_graph.diagnosis.findings import (
     shift_line,
     signed_axes,
     unknown,
+    unused,
     with_interval,
     worst_first,
 )
@@ -88,6 +97,7 @@ from sonar_graph.logs import (
     FELT_ALONG,
     OTHER_WAYS,
     STEPPED_BACK,
+    TAKEN_AS_ZERO,
     axis_doubts,
     gravity_warning,
     row_notes,
@@ -157,7 +167,8 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     """
     # matrices are small: threads of BLAS would only wait for each other
     with threadpool_limits(1, user_api="blas"):
-        return worst_first(all_findings(sequence, config or LogConfig()))
+        findings = all_findings(sequence, config or LogConfig())
+    return worst_first([*unplaced_findings(sequence, findings), *findings])
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
@@ -250,6 +261,11 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
     if any(f.acts and f.quantity.endswith(PITCH.name) for f in by_motion):
         lever = [Finding(ARM, unknown("IMU or Doppler log is pitched"), "m")]
+    # gyros that are late against the forces look like an arm
+    angles = (HEADING.name, AZIMUTH.name)
+    delays = [f for f in by_motion if f.quantity.endswith(": delay") and f.acts]
+    if any(f.quantity.startswith(angles) for f in delays):
+        lever = [Finding(ARM, unknown("gyros or other sensors are late"), "m")]
     reference = list(reference_findings(right, config, tilt))
     if right.calibration.start.states("rpy_rad"):
         off = tilt.angle(1).minus(right.calibration.start.rpy_rad[1])
@@ -281,6 +297,17 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         *of_map,
         *noise,
     ]
+
+
+def unplaced_findings(sequence: Sequence, findings: list[Finding]) -> Iterator[Finding]:
+    """Mountings that are not known, where sensors contradict each other: they come before all that may follow from them."""
+    warnings = sequence.notes.get("log.warnings", "").split("; ")
+    roles = [text.partition(":")[0] for text in warnings if TAKEN_AS_ZERO in text]
+    if roles and any(finding.grave for finding in findings):
+        names = ", ".join(roles)
+        cause = f"those of {names} are not in the log and count as zero, which may be all that is wrong"
+        line = f"give them {IN_CALIBRATION} first"
+        yield contradiction("mountings", cause, line, "not known")
 
 
 def spoilt_by(sequence: Sequence) -> str:
@@ -438,10 +465,9 @@ def axes_findings(
         cause = f"{CONTRADICTED}, and no axes fit clearly better"
         return [no_axes_finding(ANY_AXES, cause)], sequence
     findings = list[Finding]()
-    # gyros and Doppler log agree with each other: rates are reflected the other way
-    is_force = (found.gyro == np.linalg.det(found.dvl) * found.dvl).all()
     # gravity is felt upwards: of the accelerometers only level axes can be wrong
-    is_force &= found.dvl[2, 2] == 1.0
+    is_level = found.dvl[2, 2] == 1.0
+    is_force = is_of_force(found.gyro, found.dvl) and is_level
     if is_force and (found.dvl != np.eye(3)).any():
         return force_axes(found, sequence, config)
     if (found.gyro != np.eye(3)).any():
@@ -604,10 +630,17 @@ def motion_findings(
     ]
     found = list[Finding]()
     # one of them may be mirrored; of two, the gyros are
+    rightly_turned = right
     if len(against_gyros) > 1:
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
-        right = scaled_gyros(right, Z_NEGATED)
+        rightly_turned = scaled_gyros(right, Z_NEGATED)
+    scale = HeadingScale.of(rightly_turned, matches[HEADING])
+    if scale and scale.is_shared and rightly_turned is right:
+        found += heading_findings(matches[HEADING], right, config, motion)
+        rightly_turned = scaled_gyros(right, scale.gain * np.eye(3))
+    if rightly_turned is not right:
+        right = rightly_turned
         motion = BodyMotion.of(right)
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
@@ -626,7 +659,14 @@ def motion_findings(
         )
         if match is not None and not is_range_wrong:
             found += findings_of(check, match, right, config)
-    of_heading = list(heading_findings(matches[HEADING], right, config, motion))
+    named = {f.quantity for f in found}
+    of_heading = [
+        f
+        for f in heading_findings(matches[HEADING], right, config, motion)
+        if f.quantity not in named
+    ]
+    if scale is not None:
+        of_heading = [scale.judged(f) for f in of_heading]
     is_heading_wrong = any(
         f.quantity == HEADING.quantity and f.acts for f in of_heading
     )
@@ -645,6 +685,38 @@ def motion_findings(
     if not any(f.grave for f in found):
         found += start_place_findings(right, motion)
     return found
+
+
+class HeadingScale(NamedTuple):
+    """Scale of the heading over the gyros, and what other sensors make of gyros that are scaled by as much."""
+
+    gain: float
+    apart: str
+    """Names of sensors that agree with such gyros less; empty without any."""
+    is_shared: bool
+    """True where azimuths or fixes agree with them better, and no sensor less: the gyros are wrong."""
+
+    @classmethod
+    def of(cls, right: Sequence, of_heading: Match | None) -> "HeadingScale | None":
+        """None where the heading turns as the gyros do, or not by a scale."""
+        if of_heading is None or of_heading.misfit >= MOST_MISFIT:
+            return None
+        gain = of_heading.gain
+        is_scale = 1 / OTHER_UNIT < gain.value < OTHER_UNIT
+        if not is_scale or not matters(gain.minus(1.0), HEADING.least_scale):
+            return None
+        scaled = scaled_gyros(right, gain.value * np.eye(3))
+        apart = brought_apart(right, scaled)
+        nearer = brought_apart(scaled, right)
+        by_others = AZIMUTH.name in nearer or POSITIONS.name in nearer
+        return cls(gain.value, apart, by_others and not apart)
+
+    def judged(self, finding: Finding) -> Finding:
+        """The row of the heading's scale, which is its own where other sensors agree with the gyros."""
+        if not (self.apart and finding.acts and finding.quantity == HEADING.quantity):
+            return finding
+        cause = f"the gyros fit {self.apart} as they are: the heading has a wrong scale, or deviates with its direction"
+        return replace(finding, cause=cause, line=unused(HEADING.role))
 
 
 def dvl_findings(

@@ -15,6 +15,8 @@ PAIR_S = 1.0
 LONGEST_PAIR_S = 3.0
 """And short enough to turn little."""
 FEWEST_PAIRS = 20
+PASSAGE_S = 10.0
+"""Time in which a landmark stays above or below the sonar."""
 
 
 def sighting_pairs(seen: LandmarkDetections, t: Floats, last_s: float) -> Ints | None:
@@ -44,6 +46,8 @@ class SightingChanges:
 
     range: SignalStretch
     azimuth: SignalStretch
+    error_by_elevation: float
+    """Error of the gain of ranges for each radian of the landmarks' elevation."""
 
 
 def sighting_changes(
@@ -119,7 +123,24 @@ def sighting_changes(
 
     changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     longer = seen.range_m[j] - seen.range_m[i]
+    climbed = np.asarray(height(t[j]) - height(t[i]), np.float64)
+    passage_of = np.stack([seen.most_probable()[0][i], t[j] // PASSAGE_S])
+    passage = np.unique(passage_of, axis=1, return_inverse=True)[1].ravel()
     return SightingChanges(
         SignalStretch(t[j], longer, by_range, has_offset=False, beside=by_others),
         SignalStretch(t[j], changed, by_azimuth, has_offset=False),
+        by_climb(by_range(t[j]), climbed, passage),
     )
+
+
+def by_climb(longer: Floats, climbed: Floats, passage: Ints) -> float:
+    """Error of the gain of ranges for each radian of elevation e, of k pairs: changes of range, height, and a number.
+
+    A vehicle that climbs by dz comes nearer by ``sin(e) dz``, which least squares take for ``sum e dz dr / sum dr^2``.
+    During one passage of a landmark e has one sign; a vehicle that dives along its way has the same one at all of them.
+    """
+    is_known = np.isfinite(longer) & np.isfinite(climbed)
+    dr = np.where(is_known, longer, 0.0)
+    dz = np.where(is_known, climbed, 0.0)
+    of_passages = np.bincount(passage, weights=dz * dr)
+    return float(np.abs(of_passages).sum() / max(dr @ dr, 1e-12))

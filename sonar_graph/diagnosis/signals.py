@@ -134,9 +134,16 @@ class RobustFit:
 
     @classmethod
     def of(
-        cls, columns: Values, stretch: SignalStretch, drift_sigma: float
+        cls,
+        columns: Values,
+        stretch: SignalStretch,
+        drift_sigma: float,
+        fitting: NDArray[np.bool_] | bool = True,
     ) -> "RobustFit":
-        """Fit columns of the reference, shape (k, n, q), and what drifts, without outlying rows."""
+        """Fit columns of the reference, shape (k, n, q), and what drifts, without outlying rows.
+
+        ``fitting``: rows to begin with, which another fit has kept, shape (k, n).
+        """
         t = stretch.seconds - stretch.seconds.mean()
         slow = [np.ones_like(t)] * stretch.has_offset + [t] * (drift_sigma > 0)
         nuisance = np.reshape(slow, (len(slow), len(t))).T
@@ -147,7 +154,7 @@ class RobustFit:
         # the far origin of a map grid would cost digits
         offset = np.nanmean(stretch.y) if stretch.has_offset else 0.0
         y = np.where(usable, stretch.y - offset, 0.0)
-        kept = usable
+        kept = usable & fitting
         prior = np.zeros(len(A))
         for _ in range(ROUNDS):
             AH = np.swapaxes((A * kept[:, :, None]).conj(), 1, 2)  # (k, p, n)
@@ -248,12 +255,16 @@ def refined(
     lags = list[tuple[float, float]]()
     residuals = list[Values]()
     for stretch in stretches:
-        columns = [stretch.shifted(np.array([lag_s]))[0]]
-        if find_lag:
-            columns.append(stretch.slope(lag_s))
         # one candidate: the grid has chosen the lag and the sense
-        x = np.stack(columns, axis=1)[None]  # (1, n, 1 or 2)
-        found = RobustFit.of(x.conj() if is_mirrored else x, stretch, drift_sigma)
+        x = stretch.shifted(np.array([lag_s]))[:, :, None]  # (1, n, 1)
+        x = x.conj() if is_mirrored else x
+        found = RobustFit.of(x, stretch, drift_sigma)
+        if find_lag:
+            slope = stretch.slope(lag_s)[None, :, None]
+            slope = slope.conj() if is_mirrored else slope
+            # a far row with a large slope would make a delay of its own
+            columns = np.concatenate([x, slope], axis=2)  # (1, n, 2)
+            found = RobustFit.of(columns, stretch, drift_sigma, found.kept)
         if not found.rows[0]:
             continue
         c = found.p[0, 0]

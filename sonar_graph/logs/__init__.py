@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from sonar_graph.logs.roles import DETECTIONS, ROLES, Choice, Window, choose_each, choose_topics, wanted_types
     from sonar_graph.logs.sonar_images import ImagesAlone, joined_calibration, lacking_navigation, no_images, read_images_alone, read_sonar_frames, sonar_frame  # noqa: E501
     from sonar_graph.logs.trajectory_files import write_landmarks_csv, write_tum
-    from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, with_notes
+    from sonar_graph.logs.vehicle_setup import METADATA, TAKEN_AS_ZERO, PartialCalibration, with_notes
     from sonar_graph.logs.viewer_messages import PICTURES, Picture, landmark_markers
     from sonar_graph.logs.writing import detection_messages, landmark_map_message, sonar_image_messages, write_log
 else:
     __getattr__, __dir__ = at_first_use(__name__)
 __all__ = [
-    "Amended", "Assembly", "Choice", "DETECTIONS", "DRIFTING", "DROPPED_TOPIC", "FELT_ALONG", "ImagesAlone", "LATENESS",
-    "LIVE_RATE", "LiveRecord", "LogSummary", "METADATA", "OTHER_WAYS", "PICTURES", "PartialCalibration", "Picture", "ROLES",
-    "STEPPED_BACK", "TopicSummary", "Window", "axis_doubts", "choose_each", "choose_topics", "detection_messages",
-    "dropped_in", "gravity_warning", "inspect_log", "is_without_gravity", "joined_calibration", "lacking_navigation",
-    "landmark_map_message", "landmark_markers", "no_images", "pinned", "read_images_alone", "read_log",
-    "read_sonar_frames", "row_notes", "rows_of", "sonar_frame", "sonar_image_messages", "stuck_quantities",
-    "unfelt_zeros", "wanted_types", "with_notes", "write_amended", "write_landmarks_csv", "write_log", "write_result",
-    "write_tum"]
+    "Amended", "Assembly", "Choice", "DETECTIONS", "DRIFTING", "DROPPED_TOPIC", "FELT_ALONG", "ImagesAlone",
+    "LATENESS", "LIVE_RATE", "LiveRecord", "LogSummary", "METADATA", "OTHER_WAYS", "PICTURES", "PartialCalibration",
+    "Picture", "ROLES", "STEPPED_BACK", "TAKEN_AS_ZERO", "TopicSummary", "Window", "axis_doubts", "choose_each",
+    "choose_topics", "detection_messages", "dropped_in", "gravity_warning", "inspect_log", "is_without_gravity",
+    "joined_calibration", "lacking_navigation", "landmark_map_message", "landmark_markers", "no_images", "pinned",
+    "read_images_alone", "read_log", "read_sonar_frames", "row_notes", "rows_of", "sonar_frame",
+    "sonar_image_messages", "stuck_quantities", "unfelt_zeros", "wanted_types", "with_notes", "write_amended",
+    "write_landmarks_csv", "write_log", "write_result", "write_tum"]

@@ -329,16 +329,21 @@ def row_oddities(
     """Results of the checks of numbers by role; None: nothing is wrong."""
     # of wheels rates jump, and values stay the same
     is_linear = calibration.odometry_interpolation == "linear"
+    # quantities that are stuck beside others have a doubt of their own
+    stuck = stuck_quantities(imu, dvl) if imu is not None and dvl is not None else {}
+    named = {quantity for quantity, rows in stuck.items() if rows.any()}
     if imu is not None and is_linear:
         quantities = {
             "angular rate": imu.angular_velocity,
             "specific force": imu.specific_force,
         }
-        for check in (spike_warning, stuck_warning):
-            for quantity, values in quantities.items():
-                yield "imu", check(imu.stamps_ns, values, quantity)
+        for quantity, values in quantities.items():
+            yield "imu", spike_warning(imu.stamps_ns, values, quantity)
+            if quantity not in named:
+                yield "imu", stuck_warning(imu.stamps_ns, values, quantity)
     if dvl is not None and is_linear:
-        yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
+        if "velocity" not in named:
+            yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
         if not is_measured_in_full(depth, calibration):
             for fault in dead_axes(dvl.velocity, "velocity"):
                 yield "dvl", fault
@@ -527,7 +532,8 @@ def stuck_warning(
         texts.append(f"{what} in {rows} rows{more} {times} s after the first")
     if not texts:
         return None
-    return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be sending without lock"
+    why = "sending without lock" if quantity == "velocity" else "repeating old values"
+    return f"{quantity} {' and '.join(texts)}: used as measured; unless at rest, a driver may be {why}"
 
 
 def differing(values: NDArray[Any]) -> Mask:
@@ -745,11 +751,14 @@ def unlikely_zeros(values: Floats, moved: Floats, least: float) -> Mask:
 
 
 def repeats(values: Floats, moved: Floats, least: float) -> Mask:
-    """Mask of rows, shape (n,), that repeat the row before to the bit while the vehicle moves: a stuck sensor.
+    """Mask of rows, shape (n,), that repeat the row before while the vehicle moves: a stuck sensor.
+
+    To a billionth: a yaw that stands still in an orientation that tilts is the same but for rounding.
 
     ``values``, shape (n, k), and ``moved``, what the vehicle has moved until each row by other sensors, have one unit.
     A stretch counts where the vehicle moves in it by more than ``least`` and three steps of the sensor's resolution.
     """
+    values = np.round(values, 9)
     # the smallest difference of any two values of a sensor is its resolution
     gaps = [np.diff(np.unique(np.round(column, 6))) for column in values.T]
     resolution = float(np.min(np.concatenate(gaps), initial=np.inf))

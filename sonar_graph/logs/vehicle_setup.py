@@ -356,10 +356,13 @@ def with_fields(recorded: Values, *changes: Values) -> str:
     return json.dumps(recorded)
 
 
+TAKEN_AS_ZERO = "mounting taken as zero"
+
+
 def unplaced(sensor: str, frame: str, *, has_tree: bool) -> str:
     """Warning about a sensor whose place is not known, with what states it."""
     where = f"[{sensor}] {MOUNTING_FIELDS[sensor]} in a file for --calibration"
-    taken = "mounting taken as zero; give"
+    taken = f"{TAKEN_AS_ZERO}; give"
     if not frame:
         return f"{sensor}: no frame in its messages: {taken} {where}"
     missing = f"{sensor}: no transform from {frame} to {BODY_FRAME}"

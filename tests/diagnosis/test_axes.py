@@ -66,6 +66,43 @@ def test_signs_of_the_doppler_log_are_found_and_the_gyros_left_alone(
     assert (found.dvl == np.diag(axes)).all()
 
 
+@pytest.mark.parametrize(
+    "axes",
+    [
+        [(-1, 0, 0), (0, 1, 0), (0, 0, 1)],
+        [(1, 0, 0), (0, -1, 0), (0, 0, 1)],
+        [(0, 1, 0), (1, 0, 0), (0, 0, 1)],
+        [(0, -1, 0), (1, 0, 0), (0, 0, 1)],
+    ],
+)
+def test_level_axes_of_the_accelerometers_are_found_with_a_doppler_log_on_a_long_arm(
+    axes: list[tuple[float, float, float]],
+) -> None:
+    """Rates and velocities agree and so does the arm between them: in the forces' axes it is turned as they are."""
+    S = np.array(axes, dtype=np.float64)
+    arm_m = np.array([0.6, 0.4, 0.2])
+    body_R_dvl = WORLD.calibration.dvl.mounting.pose().rotation().matrix()
+    body_R_imu = WORLD.calibration.imu.mounting.pose().rotation().matrix()
+    columns = (WORLD.imu.angular_velocity @ body_R_imu.T).T
+    stamps_ns = WORLD.imu.stamps_ns
+    rate = np.array([np.interp(WORLD.dvl.stamps_ns, stamps_ns, c) for c in columns]).T
+    moved = WORLD.dvl.velocity + np.cross(rate, arm_m) @ body_R_dvl
+    mounting = WORLD.calibration.dvl.mounting
+    place = np.add(mounting.translation_m, arm_m).tolist()
+    dvl = WORLD.calibration.dvl.model_copy(
+        update={"mounting": mounting.model_copy(update={"translation_m": place})}
+    )
+    force = WORLD.imu.specific_force @ body_R_imu.T @ S.T @ body_R_imu
+    found = match_axes(
+        replace(WORLD.imu, specific_force=force),
+        replace(WORLD.dvl, velocity=moved),
+        WORLD.calibration.model_copy(update={"dvl": dvl}),
+    )
+    assert found is not None
+    assert (found.dvl == S).all()
+    assert (found.gyro == np.linalg.det(S) * S).all()
+
+
 def test_without_accelerometers_or_motion_nothing_is_known() -> None:
     none = np.full_like(WORLD.imu.specific_force, np.nan)
     imu = replace(WORLD.imu, specific_force=none)
@@ -105,3 +142,12 @@ def test_velocities_in_axes_of_the_world_are_named_before_all_else(
     assert ratio > 2.0
     first, *_ = check_sensors(run, LogConfig())
     assert "axes of the world" in first.text()
+
+
+def test_rows_of_the_doppler_log_in_a_hole_of_the_imu_contradict_no_axes() -> None:
+    t = (WORLD.imu.stamps_ns - WORLD.imu.stamps_ns[0]) * 1e-9
+    imu = WORLD.imu.rows((t <= 30.0) | (t >= 55.0))
+    found = match_axes(imu, WORLD.dvl, WORLD.calibration)
+    assert found is not None
+    assert (found.gyro == IDENTITY).all()
+    assert (found.dvl == IDENTITY).all()

@@ -9,6 +9,7 @@ import pytest
 
 from sonar_graph.calibration import Calibration, PositionCalibration
 from sonar_graph.diagnosis import check_sensors
+from sonar_graph.diagnosis.causes import velocity_steps
 from sonar_graph.measurements import (
     Depth,
     Floats,
@@ -189,3 +190,43 @@ def test_ranges_on_a_straight_way_blame_the_scale_and_no_current():
 
 def test_right_sensors_have_no_cause():
     assert not [found.quantity for found in check_sensors(observed()) if found.acts]
+
+
+@pytest.mark.parametrize("wrong", ["heading", "gyros"])
+def test_a_scale_of_the_heading_is_told_from_one_of_the_gyros_by_the_fixes(wrong: str):
+    """Fixes lie along the true path: its turns are those of the gyros, or those of the heading."""
+    run = observed(yaw_rad=1.12 * YAW) if wrong == "heading" else observed()
+    if wrong == "gyros":
+        rate = run.imu.angular_velocity / 1.12
+        run = replace(run, imu=replace(run.imu, angular_velocity=rate))
+    acting = [f for f in check_sensors(run) if f.grave]
+    (found,) = (f for f in acting if f.quantity.startswith("heading: turn over"))
+    assert found.estimate.value == pytest.approx(1.12, abs=0.01)
+    line = {
+        "heading": "use = false` under [heading]",
+        "gyros": "angular_velocity_scale = 1.12",
+    }
+    assert line[wrong] in found.line
+    assert not [f.quantity for f in acting if f.quantity.startswith("position fixes")]
+
+
+@pytest.mark.parametrize("is_felt", [True, False])
+def test_velocities_that_change_where_no_force_was_measured_have_lost_nothing(
+    is_felt: bool,
+):
+    """The vehicle speeds up in 4 s of which the accelerometers have the first and the last sample alone."""
+    run = observed()
+    t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    push = 0.3 * ((t > 30.0) & (t < 34.0))
+    force = run.imu.specific_force + push[:, None] * [1.0, 0.0, 0.0]
+    if not is_felt:
+        force[(t > 29.0) & (t < 35.0)] = np.nan
+    of_dvl = (run.dvl.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    faster = 0.3 * np.clip(of_dvl - 30.0, 0.0, 4.0)
+    velocity = run.dvl.velocity + faster[:, None] * [1.0, 0.0, 0.0]
+    run = replace(
+        run,
+        imu=replace(run.imu, specific_force=force),
+        dvl=replace(run.dvl, velocity=velocity),
+    )
+    assert velocity_steps(run) is None

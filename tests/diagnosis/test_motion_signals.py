@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis import aiding_check
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.diagnosis.sightings import sighting_changes
+from sonar_graph.diagnosis.sightings import by_climb, sighting_changes
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Heading, LandmarkDetections
 from sonar_graph.sequence import Sequence
@@ -150,3 +150,50 @@ def test_a_sonar_that_looks_down_sees_ranges_change_as_the_vehicle_climbs(
     expected = np.linalg.norm(place - moved) - 10.0
     found = changes.range.reference(changes.range.seconds)
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def seen_ahead(level_m: np.ndarray, below_m: np.ndarray) -> LandmarkDetections:
+    """One landmark ahead of a level sonar, by its level distance and depth below the sonar, shape (n,) each."""
+    n = len(level_m)
+    return LandmarkDetections(
+        np.arange(n, dtype=np.int64) * 500_000_000,
+        np.hypot(level_m, below_m),
+        np.zeros(n),
+        np.tile(np.diag([1e-4, 1e-4]), (n, 1, 1)),
+        np.zeros((n, 1), dtype=np.int64),
+        np.ones((n, 1)),
+    )
+
+
+@pytest.mark.parametrize(("climb_m_s", "is_sure"), [(-0.15, False), (0.0, True)])
+def test_a_dive_towards_landmarks_is_no_scale_of_their_ranges(
+    climb_m_s: float, is_sure: bool
+) -> None:
+    """A landmark at the end of the dive is nearer by sin(e) dz; its right ranges leave the gain's interval at 1."""
+    seconds = np.arange(0.0, 40.0, 0.5)
+    motion = by_hand(seconds, [0] * len(seconds), climb_m_s * seconds)
+    lever = RUN.calibration.sonar.mounting.translation_m[0]
+    until_next = 10.0 - seconds % 10.0
+    seen = seen_ahead(9.0 - lever + 0.5 * until_next, climb_m_s * until_next)
+    seen = replace(seen, candidate_ids=(seconds[:, None] // 10).astype(np.int64))
+    level = Mounting(translation_m=(lever, 0.0, 0.0))
+    sonar = RUN.calibration.sonar.model_copy(update={"mounting": level})
+    calibration = RUN.calibration.model_copy(update={"sonar": sonar})
+    run = replace(RUN, detections=seen, calibration=calibration)
+    found = aiding_check.sighting_match(run, motion, of_range=True)
+    assert found is not None
+    assert abs(found.gain.value - 1.0) < 2.0 * found.gain.sigma + 1e-3
+    assert (found.gain.sigma < 0.01) == is_sure
+
+
+def test_heave_that_has_nothing_to_do_with_the_ranges_leaves_their_gain_sure() -> None:
+    """A dz that is as often up as down while a landmark comes nearer adds nothing: sum dz dr of a passage is small."""
+    longer = -0.5 * np.ones(40)
+    heave = np.tile([0.05, -0.05], 20)
+    passage = np.zeros(40, dtype=np.int64)
+    assert by_climb(longer, heave, passage) == pytest.approx(0.0, abs=1e-12)
+    dive = np.full(40, -0.25)
+    assert by_climb(longer, dive, passage) == pytest.approx(0.5)
+    # the sides on which two passages pass do not cancel each other
+    halves = np.repeat([0, 1], 20)
+    assert by_climb(longer, np.repeat([0.25, -0.25], 20), halves) == pytest.approx(0.5)

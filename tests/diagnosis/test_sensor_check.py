@@ -14,6 +14,7 @@ from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_units
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.vehicle_setup import unplaced
 from sonar_graph.measurements import Dvl, Floats, Heading, Imu
 from sonar_graph.navigation.alignment import DvlMatch, Estimate1D, InitialTilt
 from sonar_graph.sequence import Sequence
@@ -515,3 +516,17 @@ def test_values_in_steps_far_above_their_noise_are_named_alone(sensor: str) -> N
         run = replace(run, depth=replace(run.depth, z_m=z_m))
     found = [f.quantity for f in coarse_findings(run)]
     assert found == ([] if sensor == "none" else [f"{sensor}: resolution"])
+
+
+@pytest.mark.parametrize("is_wrong", [True, False])
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_a_mounting_that_is_not_known_is_named_before_what_may_follow_from_it(
+    is_wrong: bool, is_placed: bool
+) -> None:
+    dvl = SHORT.dvl
+    velocity = dvl.velocity * ([1.0, -1.0, -1.0] if is_wrong else 1.0)
+    notes = {} if is_placed else {"log.warnings": unplaced("dvl", "x", has_tree=True)}
+    run = replace(SHORT, dvl=replace(dvl, velocity=velocity), notes=notes)
+    grave = [f.quantity for f in sensor_check.check_sensors(run) if f.grave]
+    assert bool(grave) == is_wrong
+    assert (grave[:1] == ["mountings"]) == (is_wrong and not is_placed)

@@ -127,3 +127,20 @@ def test_a_reference_that_is_known_nowhere_gives_no_warning():
     found = match([at_rows], find_lag=False)
     assert found.gain.value == pytest.approx(1.0)
     assert np.isnan(found.rate)
+
+
+@pytest.mark.parametrize("far", [2.0, -1.7])
+def test_far_rows_on_a_steep_slope_make_no_delay(far: float):
+    """Two of thirty rows are wrong, and the reference changes fast at the first of them."""
+    t = np.arange(30.0)
+
+    def steep(seconds: Floats) -> Floats:
+        return 0.14 * np.sin(0.25 * seconds) + np.tanh(4.0 * (seconds - 0.1))
+
+    y = steep(t) + 0.01 * np.random.default_rng(5).standard_normal(30)
+    y[[0, 27]] += far, 0.7 * far
+    found = match([SignalStretch(t, y, steep, has_offset=False)])
+    assert found.gain.value == pytest.approx(1.0, abs=4.5 * found.gain.sigma)
+    assert found.gain.sigma < 0.05
+    assert found.lag.value == pytest.approx(0.0, abs=max(0.2, 4.5 * found.lag.sigma))
+    assert found.scatter == pytest.approx(0.01, rel=0.4)

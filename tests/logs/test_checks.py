@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import (
     Calibration,
@@ -19,6 +20,7 @@ from sonar_graph.logs.checks import (
     gap_warnings,
     magnitudes,
     repeated_sightings,
+    repeats,
     row_doubts,
     spike_warning,
     stamp_doubts,
@@ -397,3 +399,17 @@ def test_two_imus_on_one_topic_are_named_and_gravity_is_not_missing():
     both = Imu(EVEN, np.zeros_like(force), force)
     (found,) = row_doubts(both, None, None, Calibration())
     assert "two IMUs" in found
+
+
+def test_a_yaw_that_stands_still_in_an_orientation_that_tilts_repeats_itself() -> None:
+    """Yaw of quaternions whose roll changes is the same but for rounding."""
+    roll = np.linspace(0.0, 0.3, 200)
+    yaw = np.full(200, 1.0)
+    yaw[:100] += np.linspace(-0.5, 0.0, 100)
+    angles = np.column_stack([yaw, np.zeros(200), roll])
+    turned = Rotation.from_euler("ZYX", angles).as_quat()
+    read = Rotation.from_quat(turned).as_euler("ZYX")[:, :1]
+    assert np.unique(read[100:]).size > 1
+    found = repeats(read, moved=np.linspace(0.0, 4.0, 200), least=0.2)
+    assert found[101:].all()
+    assert not found[:99].any()

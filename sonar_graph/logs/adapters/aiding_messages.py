@@ -49,6 +49,7 @@ ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 World = Literal["enu", "ned"]
 ENU_R = {"enu": np.eye(3), "ned": ENU_R_NED}
 """``enu_R_world`` of each kind of world."""
+DEGREES_IN = {"degE7": 1e-7, "rad": float(np.degrees(1.0))}
 STEEPEST_RAD = np.radians(80.0)
 """Pitch above which roll and yaw are hardly distinct."""
 NO_MEASUREMENT = "whose orientation is no measurement"
@@ -190,8 +191,8 @@ class GeodeticFields(PathSection):
     """Degrees, north."""
     longitude: str
     """Degrees, east."""
-    unit: Literal["deg", "ddmm.mmmm", "rad"] = "deg"
-    """Of both: "ddmm.mmmm" for degrees and minutes written as one number, as receivers do (NMEA)."""
+    unit: Literal["deg", "degE7", "ddmm.mmmm", "rad"] = "deg"
+    """Of both: "degE7" for integers of 1e-7 degrees (MAVLink, u-blox), "ddmm.mmmm" for degrees and minutes (NMEA)."""
     height: str | None = None
     """Metres above the ellipsoid, or any other level; none, or not finite: not measured."""
     status: str | None = None
@@ -209,8 +210,8 @@ class GeodeticFields(PathSection):
             # 4807.038 is 48 degrees and 7.038 minutes
             degrees = np.trunc(place / 100)
             place = degrees + (place - 100 * degrees) / 60
-        elif self.unit == "rad":
-            place = np.degrees(place)
+        elif self.unit != "deg":
+            place = place * DEGREES_IN[self.unit]
         height = np.full(len(table), np.nan)
         if self.height:
             height = table.column(self.height).astype(float)
@@ -227,7 +228,10 @@ class GeodeticFields(PathSection):
         latitude = np.abs(table.column(self.latitude).astype(float))
         if self.unit != "deg" or not np.median(latitude) > 90.0:
             return ""
-        return f' ({self.latitude} is up to {np.nanmax(latitude):.6g}: unit = "ddmm.mmmm" inside geodetic?)'
+        largest = float(np.nanmax(latitude))
+        # 90 degrees as degrees and minutes are 9000
+        unit = "ddmm.mmmm" if largest <= 9000.0 else "degE7"
+        return f' ({self.latitude} is up to {largest:.6g}: unit = "{unit}" inside geodetic?)'
 
     def first_fix(self, table: FieldTable) -> Origin | None:
         """Place of the first fix by its stamp, with the first height that was measured; None without a fix."""

@@ -349,10 +349,20 @@ def test_a_template_of_tables_with_names_and_units_reads_them_unedited(tmp_path)
     assert "notes.md: has no line with numbers" in text
 
 
-def test_truth_from_roll_pitch_yaw_and_geodetic_minutes(tmp_path):
+@pytest.mark.parametrize(
+    ("unit", "rows", "largest"),
+    [
+        ("ddmm.mmmm", "4212.0,306.0 4213.0,306.0", "4213"),
+        ("degE7", "422000000,31000000 422166667,31000000", "4.22167e[+]08"),
+    ],
+)
+def test_truth_from_roll_pitch_yaw_and_units_of_receivers(
+    tmp_path, unit, rows, largest
+):
     (tmp_path / "imu.csv").write_text("time,a,b,c\n0,0,0,1\n9,0,0,1\n")
+    first, last = rows.split()
     (tmp_path / "gt.csv").write_text(
-        "time,lat,lon,r,p,y\n0,4212.0,306.0,0,0,90\n9,4213.0,306.0,10,20,-30\n"
+        f"time,lat,lon,r,p,y\n0,{first},0,0,90\n9,{last},10,20,-30\n"
     )
     triple = ["a", "b", "c"]
     config = {
@@ -364,7 +374,7 @@ def test_truth_from_roll_pitch_yaw_and_geodetic_minutes(tmp_path):
         "dvl": {"file": "imu.csv", "velocity": triple},
         "truth": {
             "file": "gt.csv",
-            "geodetic": {"latitude": "lat", "longitude": "lon", "unit": "ddmm.mmmm"},
+            "geodetic": {"latitude": "lat", "longitude": "lon", "unit": unit},
         }
         | {"rpy": ["r", "p", "y"], "rpy_scale": "deg"},
     }
@@ -376,6 +386,6 @@ def test_truth_from_roll_pitch_yaw_and_geodetic_minutes(tmp_path):
     del config["truth"]["geodetic"]["unit"]
     with pytest.raises(
         LogError,
-        match=r'gt\.csv: \[truth\] none of its 2 rows .* \(lat is up to 4213: unit = "ddmm',
+        match=rf'gt\.csv: \[truth\] none of its 2 rows .* \(lat is up to {largest}: unit = "{unit}',
     ):
         read_csv(tmp_path, config)
