@@ -26,7 +26,12 @@ from sonar_graph.report.figure_style import (
 )
 from sonar_graph.report.figures import growth_figure, illustrations, map_figure
 from sonar_graph.report.figures.error_figures import errors_cut_off
-from sonar_graph.report.figures.maps import enlargement
+from sonar_graph.report.figures.maps import (
+    ENLARGED,
+    LARGEST_ELLIPSE,
+    enlargement,
+    map_view,
+)
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
@@ -243,6 +248,30 @@ def test_ellipses_are_as_large_as_the_caption_says():
     assert (
         f"drawn {factor} times as large" in illustrations(comparison)["growth"].caption
     )
+
+
+@pytest.mark.parametrize("sigma_m", [0.001, 0.02, 0.05, 0.15, 9.0])
+def test_ellipses_are_as_large_as_the_figure_has_room_for(sigma_m):
+    """By the widest ellipse of the maps that are drawn; heights and maps of other instants do not count."""
+    comparison = grown(sigma_m=sigma_m / 3)
+    runs = []
+    for run in comparison.runs:
+        maps = list(run.maps)
+        if maps:
+            widest = replace(
+                maps[-1].landmarks, covariances=maps[-1].landmarks.covariances.copy()
+            )
+            widest.covariances[1] = np.diag([sigma_m**2, 0.0, 1e6])
+            maps[-1] = replace(maps[-1], landmarks=widest)
+            between = replace(widest, covariances=1e4 * widest.covariances)
+            maps.append(MapSoFar(maps[0].stamp_ns + 1, between))
+        runs.append(replace(run, maps=maps))
+    comparison = replace(comparison, runs=runs)
+    factor = enlargement(comparison)
+    room_m = LARGEST_ELLIPSE * np.ptp(map_view(comparison), axis=0).max()
+    half_m = sigma_m * np.sqrt(chi2.ppf(0.95, 2))
+    fitting = [f for f in ENLARGED if f * half_m <= room_m]
+    assert factor == (fitting[-1] if fitting else 1)
 
 
 def test_without_maps_on_the_way_the_page_says_so():
