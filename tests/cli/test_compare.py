@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -279,3 +280,34 @@ def test_demo_drives_the_three_laps_of_the_paper_with_images():
     assert options.laps == PAPER_LAPS
     assert options.image is not None
     assert cruise_speed(options) < FASTEST_M_S
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+def test_the_documented_commands_convert_inspect_and_reckon(
+    run, recordings, tmp_path, monkeypatch, capsys
+):
+    """A pool run with a Doppler log of unknown axes: the commands and the file of the page, and no code."""
+    section = PAGE.read_text(encoding="utf-8").split("## SONIA")[1]
+    (toml,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
+    (tmp_path / "sonia.toml").write_text(toml, encoding="utf-8")
+    (tmp_path / "sonia_imu_dvl.bag").symlink_to(
+        recordings / "bags" / "sonia_imu_dvl.bag"
+    )
+    monkeypatch.chdir(tmp_path)
+    printed = []
+    for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE):
+        # the gyros' bias puts what `inspect` and `run` give in doubt
+        assert run(*line.split()) == (0 if line.startswith("convert") else 3)
+        printed.append(capsys.readouterr().out)
+    assert len(printed) == 3
+    assert re.search(
+        r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act",
+        printed[1],
+    )
+    path = np.loadtxt("sonia/runs/dead-reckoning/causal.tum")[:, 1:4]
+    assert np.all(np.ptp(path, axis=0)[:2] < 5), "the vehicle stays in the pool"
+    assert 35 < np.linalg.norm(np.diff(path, axis=0), axis=1).sum() < 50

@@ -19,7 +19,7 @@ from sonar_graph.evaluation import (
     score_table,
 )
 from sonar_graph.recognition import with_detections
-from sonar_graph.report import sentences, write_report
+from sonar_graph.report import sentences, write_page, write_report
 from sonar_graph.report.comparison_page import recognition_content, render_report
 from sonar_graph.table import Table
 from tests.synthetic import (
@@ -176,6 +176,12 @@ def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
     assert "Position error, not aligned" not in page.text
     assert len(page.named("svg")) == 4, "the map in two widths, and no aligned view"
     assert "show-raw" not in page.text
+
+
+@pytest.mark.slow
+def test_a_long_mission_still_makes_a_small_page(tmp_path):
+    write_page(basin_comparison(4078), tmp_path)
+    assert (tmp_path / "report.html").stat().st_size < 3_000_000
 
 
 def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):

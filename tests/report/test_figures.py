@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import Comparison, map_instants
+from sonar_graph.evaluation import Comparison, map_instants, published_maps
 from sonar_graph.evaluation.results import MapSoFar
 from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
@@ -280,3 +280,18 @@ def test_without_maps_on_the_way_the_page_says_so():
     assert illustrations(comparison)["growth"].instead
     figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
     assert len(figure.axes) == 3
+
+
+@pytest.mark.slow
+def test_only_the_repeated_experiment_names_the_papers_figures():
+    other = grown(60)
+    same = replace(
+        other, sequence=replace(other.sequence, true_landmarks=published_maps()[1])
+    )
+    for name, counterpart in (("growth", "Fig. 4"), ("yaw", "Fig. 5")):
+        assert counterpart in illustrations(same)[name].caption
+        assert "paper" not in illustrations(other)[name].caption
+    assert (
+        "same fractions of this run as its 833.1, 1369.4 and 2039.0 s"
+        in illustrations(same)["growth"].caption
+    )
