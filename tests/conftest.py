@@ -11,6 +11,7 @@ import signal
 import tarfile
 import threading
 from collections.abc import Callable, Generator
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,6 +88,14 @@ def unpacked(
         return folders[name]
 
     return unpack
+
+
+@pytest.fixture
+def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages whose figures are drawn, but not laid out and written, which takes most of the time of a page."""
+    # the function of the same name hides the module from a path of names
+    module = import_module("sonar_graph.report.figures.illustrations")
+    monkeypatch.setattr(module, "inline_svg", lambda *_: "<svg></svg>")
 
 
 @pytest.fixture(scope="session")

@@ -62,6 +62,7 @@ def test_compare_names_the_report_and_report_draws_it_again(
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_names_that_are_not_utf_8_are_read_and_escaped(run, basin, tmp_path, capsys):
     odd = basin.rename(tmp_path / "odd\udcff.mcap")
     assert (
@@ -106,6 +107,7 @@ def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(
     assert not out.exists()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_failed_run_is_written_and_reported_by_exit_code(
     run, basin, tmp_path, monkeypatch, capsys
 ):
@@ -184,6 +186,7 @@ def aided(sequence: Sequence, sense: float = 1.0) -> Sequence:
     return replace(sequence, heading=heading, positions=fixes)
 
 
+@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [

@@ -35,6 +35,7 @@ def test_no_argument_shows_the_commands(run, capsys):
         assert path[0] in shown
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_help_loads_nothing_heavy(run, basin, tmp_path):
     run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
     heavy = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}

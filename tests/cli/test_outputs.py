@@ -115,6 +115,7 @@ def test_results_never_overwrite_settings_or_a_log_of_another_program(
         assert (tmp_path / path).read_bytes() == before
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_comparison_beside_the_log_can_be_repeated(basin, run, tmp_path):
     before = basin.read_bytes()
     for _ in range(2):
@@ -178,6 +179,7 @@ def test_commands_can_be_repeated_over_what_they_wrote(run, tmp_path, capsys):
     assert (tmp_path / "link.mcap").stat().st_size > 0
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_refused_command_leaves_no_new_folder(run, basin, tmp_path):
     unreadable = tmp_path / "words.mcap"
     there = tmp_path / "there"
@@ -221,6 +223,7 @@ THEIRS = [
 ]
 
 
+@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize("ours", [None, *OURS])
 def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
     ours, basin, run, tmp_path, capsys
