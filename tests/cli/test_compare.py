@@ -48,9 +48,9 @@ def test_compare_writes_report_numbers_results_and_runs(compared):
 
 
 def test_compare_names_the_report_and_report_draws_it_again(
-    run, basin, tmp_path, capsys
+    run, dive, tmp_path, capsys
 ):
-    assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
+    assert run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
     told = capsys.readouterr()
     page = tmp_path / "report.html"
     assert f"Report: {page}" in told.out.splitlines()
@@ -63,8 +63,8 @@ def test_compare_names_the_report_and_report_draws_it_again(
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_names_that_are_not_utf_8_are_read_and_escaped(run, basin, tmp_path, capsys):
-    odd = basin.rename(tmp_path / "odd\udcff.mcap")
+def test_names_that_are_not_utf_8_are_read_and_escaped(run, dive, tmp_path, capsys):
+    odd = dive.rename(tmp_path / "odd\udcff.mcap")
     assert (
         run(
             "compare",
@@ -109,7 +109,7 @@ def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(
 
 @pytest.mark.usefixtures("unrendered")
 def test_failed_run_is_written_and_reported_by_exit_code(
-    run, basin, tmp_path, monkeypatch, capsys
+    run, dive, tmp_path, monkeypatch, capsys
 ):
     from baselines.dead_reckoning import DeadReckoning
 
@@ -118,7 +118,7 @@ def test_failed_run_is_written_and_reported_by_exit_code(
 
     monkeypatch.setattr(DeadReckoning, "process", fail)
     assert (
-        run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam")
+        run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam")
         == 1
     )
     assert "the filter is tired" in capsys.readouterr().err
@@ -130,10 +130,10 @@ def test_failed_run_is_written_and_reported_by_exit_code(
     }
 
 
-def test_run_uses_the_given_calibration_field_by_field(run, basin, tmp_path):
+def test_run_uses_the_given_calibration_field_by_field(run, dive, tmp_path):
     moved = tmp_path / "moved.toml"
     moved.write_text("[start]\nposition_m = [100.0, 0.0, -1.0]\n")
-    arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
+    arguments = ("run", dive, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
     calibrations = []
     # the truth contradicts the moved start
     for more, code in ((), 0), (("--calibration", moved), 3):
