@@ -581,7 +581,6 @@ def test_a_map_of_the_same_log_is_doubted_and_one_of_another_dive_is_not(tmp_pat
     assert "log.warnings" not in in_map(second, tmp_path / "map.toml").notes
 
 
-@pytest.mark.usefixtures("unrendered")
 def test_the_page_of_a_located_dive_shows_the_map(dive):
     """What moved comes first; estimates are shown in the map's world, without alignment."""
     known = surveyed(dive)
