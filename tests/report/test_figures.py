@@ -250,28 +250,34 @@ def test_ellipses_are_as_large_as_the_caption_says():
     )
 
 
-@pytest.mark.parametrize("sigma_m", [0.001, 0.02, 0.05, 0.15, 9.0])
-def test_ellipses_are_as_large_as_the_figure_has_room_for(sigma_m):
+@pytest.mark.parametrize("number", range(len(ENLARGED)))
+@pytest.mark.parametrize("is_just_too_large", [False, True])
+def test_ellipses_are_as_large_as_the_figure_has_room_for(number, is_just_too_large):
     """By the widest ellipse of the maps that are drawn; heights and maps of other instants do not count."""
-    comparison = grown(sigma_m=sigma_m / 3)
+    comparison = grown()
+    room_m = LARGEST_ELLIPSE * np.ptp(map_view(comparison), axis=0).max()
+    largest_m = room_m / ENLARGED[number] / np.sqrt(chi2.ppf(0.95, 2))
+    sigma_m = largest_m * (1.001 if is_just_too_large else 0.999)
     runs = []
     for run in comparison.runs:
         maps = list(run.maps)
         if maps:
-            widest = replace(
-                maps[-1].landmarks, covariances=maps[-1].landmarks.covariances.copy()
-            )
-            widest.covariances[1] = np.diag([sigma_m**2, 0.0, 1e6])
-            maps[-1] = replace(maps[-1], landmarks=widest)
-            between = replace(widest, covariances=1e4 * widest.covariances)
+            covariances = np.tile((sigma_m / 3) ** 2 * np.eye(3), (4, 1, 1))
+            covariances[1] = np.diag([sigma_m**2, 0.0, 1e6])
+            maps = [
+                replace(
+                    known,
+                    landmarks=replace(
+                        known.landmarks, covariances=covariances[: len(known.landmarks)]
+                    ),
+                )
+                for known in maps
+            ]
+            between = replace(maps[-1].landmarks, covariances=1e4 * covariances)
             maps.append(MapSoFar(maps[0].stamp_ns + 1, between))
         runs.append(replace(run, maps=maps))
-    comparison = replace(comparison, runs=runs)
-    factor = enlargement(comparison)
-    room_m = LARGEST_ELLIPSE * np.ptp(map_view(comparison), axis=0).max()
-    half_m = sigma_m * np.sqrt(chi2.ppf(0.95, 2))
-    fitting = [f for f in ENLARGED if f * half_m <= room_m]
-    assert factor == (fitting[-1] if fitting else 1)
+    expected = ENLARGED[max(number - is_just_too_large, 0)]
+    assert enlargement(replace(comparison, runs=runs)) == expected
 
 
 def test_without_maps_on_the_way_the_page_says_so():
