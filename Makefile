@@ -12,7 +12,8 @@ VENV ?= .venv
 DEMO ?= demo
 BENCH ?= bench
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --disable-pip-version-check
+# Modules are translated at their first import: most of those that pip would translate are never imported.
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-compile
 # One line on a terminal that shows what pip does, and nothing elsewhere; sh has no pipefail, so the code goes by a file.
 define install
 @echo "Installing $(1) into $(VENV)" >&2

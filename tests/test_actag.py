@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.cli import main
-from sonar_graph.errors import CalibrationError
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log
 from sonar_graph.recognition import RECOGNISERS, LandmarkRecogniser
@@ -142,6 +142,25 @@ def test_a_tag_is_reported_when_it_was_decoded_twice_in_one_place(
         result = recogniser.process(frame_of(noise(n), n), step)
         is_reported.append(result.detections is not None)
     assert is_reported == expected
+
+
+def test_bad_frames_are_not_shown_to_actag(
+    decoder,
+):
+    recogniser = made()
+    block = SonarFrames(
+        np.array([5, 6]), np.stack([noise(1), noise(2)]), RANGES_M, AZIMUTHS_RAD
+    )
+    with pytest.raises(
+        MeasurementError, match=r"a block of 2 frames; give blocks of one"
+    ):
+        recogniser.process(block)
+    refused = recogniser.process(frame_of(np.zeros((96, 512), np.uint8)))
+    assert not refused.is_used
+    assert "zero" in refused.fates[0].outcome
+    assert decoder.image is None
+    assert recogniser.process(frame_of(noise())).detections is None
+    assert decoder.image is not None
 
 
 def test_an_unknown_family_and_a_missing_package_are_named(decoder, monkeypatch):

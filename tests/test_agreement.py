@@ -257,6 +257,20 @@ def test_without_sightings_all_are_dead_reckoning():
         )
 
 
+@pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
+def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind):
+    """A constant, unobservable bias: unknown, and the same at all times."""
+    sequence = winding(gyro_bias_sigma=2e-3)
+    reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
+    poses, covariances = difference(
+        run(made(kind, sequence.calibration), sequence, 3.7), reckoned
+    )
+    assert poses < 1e-6
+    assert covariances < 1e-3
+    unaware = run(made(DeadReckoning, winding().calibration), sequence, 3.7)
+    assert difference(unaware, reckoned)[1] > 0.1
+
+
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
 def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
     """Rows of a sensor come 2 s late, in a call that ends before the one before: a fix counts, the others cannot."""

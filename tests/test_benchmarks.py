@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -170,6 +171,49 @@ def test_a_script_names_its_figures(script):
 @pytest.mark.parametrize("script", WITH_DATA)
 def test_a_script_on_recordings_names_its_figures(script, recordings):
     assert_names_its_figures(script, WITH_DATA[script], "--data", str(recordings))
+
+
+@pytest.mark.slow
+def test_golden_runs_are_kept_once_and_differ_in_what_was_changed(tmp_path):
+    chosen = ("--logs", "basin-tracks", "--estimators", "ekf-slam")
+    for folder in ("old", "new"):
+        done = run(
+            "validation/golden.py", "keep", str(tmp_path / folder), "--quick", *chosen
+        )
+        assert done.returncode == 0, done.stderr
+    assert (
+        "already kept"
+        in run(
+            "validation/golden.py", "keep", str(tmp_path / "new"), "--quick", *chosen
+        ).stderr
+    )
+    same = run(
+        "validation/golden.py", "compare", str(tmp_path / "old"), str(tmp_path / "new")
+    )
+    assert (same.returncode, same.stdout.splitlines()[-1]) == (
+        0,
+        "1 runs compared, tolerance 1e-09: equal",
+    )
+    kept = tmp_path / "new" / "basin-tracks" / "ekf-slam.npz"
+    with np.load(kept) as content:
+        arrays = dict(content)
+    arrays["smoothed_positions"][3, 1] += 0.25
+    arrays["detection_outcomes"][5] = "GATED"
+    np.savez_compressed(kept, **arrays)
+    other = run(
+        "validation/golden.py", "compare", str(tmp_path / "old"), str(tmp_path / "new")
+    )
+    assert other.returncode == 1
+    assert other.stdout.splitlines()[1].split()[2:10] == [
+        "0",
+        "0",
+        "2.5e-01",
+        "0",
+        "0",
+        "0",
+        "0",
+        "1",
+    ]
 
 
 def test_a_worse_ratio_of_speed_is_a_loss_in_both_directions(monkeypatch):

@@ -133,6 +133,21 @@ def test_a_number_that_nothing_can_have_is_refused(values, message):
     assert message in str(refusal.value)
 
 
+def test_numbers_at_the_edge_of_what_can_be_are_taken():
+    exact = {
+        "start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]},
+        "imu": {"gyro_noise_density": 0},
+    }
+    aided = {
+        "heading": {"bias_sigma_rad": 0, "sigma_rad": 2 * np.pi},
+        "dvl": {"scale_sigma": 0.2},
+    }
+    biased = parse(Calibration, {"imu": {"gyro_bias_rad_s": [1, 0, -1]}} | aided, "x")
+    assert biased.imu.gyro_bias_rad_s == (1, 0, -1)
+    at_pole = {"earth_rate_latitude_rad": -np.pi / 2, "gravity_m_s2": 9.832}
+    assert parse(Calibration, exact | at_pole, "x").gravity_m_s2 == 9.832
+
+
 def test_every_wrong_field_is_named_at_once():
     with pytest.raises(CalibrationError, match=r"gravity_m_s2.*nonsense"):
         parse(Calibration, {"gravity_m_s2": -1, "nonsense": 1}, "x")

@@ -10,6 +10,7 @@ import pytest
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.files import (
+    others_in,
     remove_written,
     replacing,
     result_folder,
@@ -161,6 +162,38 @@ def test_killed_between_two_files_all_are_still_known_as_ours(tmp_path, monkeypa
     assert contents(tmp_path) == {"a.json": "3", "b.json": "3"}
 
 
+WRITER = """
+import os, sys
+from pathlib import Path
+from sonar_graph.files import replacing, result_written
+
+with result_written(Path(sys.argv[1]), "comparison"), replacing(Path(sys.argv[1]) / "runs" / "a.json") as partial:
+    partial.write_text("half")
+    with replacing(Path(sys.argv[1]) / "b.json") as other:
+        other.write_text("half")
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_what_a_killed_command_left_is_removed_by_the_next_one(tmp_path, is_new):
+    if not is_new:
+        write(tmp_path, {"a.json": "1"})
+    mine = {f".{name}.{'0' * 24}.partial.json": "mine" for name in "ab"}
+    for name, content in mine.items():
+        (tmp_path / name).write_text(content)
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", WRITER, str(tmp_path)], check=False
+        ).returncode
+        == -9
+    )
+    assert len(contents(tmp_path)) == len(mine) + 2 + (not is_new)
+    write(tmp_path, {"a.json": "2"})
+    assert contents(tmp_path) == mine | {"a.json": "2"}
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.parametrize(
     "manifest",
     [
@@ -239,6 +272,18 @@ def test_a_second_process_is_refused_until_the_first_is_killed(
             os.kill(child, 9)
 
 
+@pytest.mark.parametrize("content", ["", "mine"])
+def test_a_file_with_the_name_of_the_lock_stays(tmp_path, content):
+    (tmp_path / ".lock").write_text(content)
+    with result_folder(tmp_path, KIND):
+        pass
+    assert (tmp_path / ".lock").read_text() == content
+    write(tmp_path, {"a.json": "1"})
+    assert others_in(tmp_path) == ([".lock"] if content else [])
+    remove_written(tmp_path)
+    assert (tmp_path / ".lock").exists() == bool(content)
+
+
 @pytest.mark.parametrize(
     "act", [lambda folder: write(folder, {"a.json": "2"}), remove_written]
 )
@@ -251,3 +296,21 @@ def test_what_is_behind_a_linked_folder_is_not_removed(tmp_path, act):
     act(folder)
     assert (mine / "x" / "b.json").read_text() == "1"
     assert (folder / "runs").is_symlink()
+
+
+def test_a_lock_that_is_a_link_or_a_folder_is_refused(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    for folder, make in (
+        (tmp_path / "a", lambda lock: lock.symlink_to(tmp_path / "mine")),
+        (tmp_path / "b", Path.mkdir),
+    ):
+        folder.mkdir()
+        make(folder / ".lock")
+        with (
+            pytest.raises(
+                EvaluationError, match=r"\.lock: cannot be opened .*choose another"
+            ),
+            result_folder(folder, KIND),
+        ):
+            pass
+    assert (tmp_path / "mine").read_text() == "mine"

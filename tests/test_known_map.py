@@ -23,6 +23,8 @@ from sonar_graph.navigation.map_start import (
     map_data,
     moved_landmarks,
 )
+from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.given_map import given_map_table, located_line
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
@@ -130,6 +132,16 @@ def test_landmarks_that_moved_are_named_and_mapped_anew(dive, kind):
     assert away[:2].max() < 0.3
 
 
+@each
+def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
+    known = surveyed(dive)
+    more = KnownMap.of(
+        [*known.ids, 99], [*known.positions_m, (500.0, 0.0, -2.0)], sigma_m=SIGMA_M
+    )
+    estimator, _ = run(kind, with_map(dive, more))
+    assert estimator.withheld() == ["of the map not seen: landmark 99"]
+
+
 RIGHT = (0.0, 0.0)
 WRONG = (1.0, -0.2)
 """Innovations of range (m) and azimuth (rad) that agree with the map, and that contradict it."""
@@ -161,6 +173,15 @@ def test_wrong_identities_here_and_there_are_no_landmark_that_moved():
     # the vehicle's way changes innovations a little from one sighting to the next
     slowly = [(0, (1.0 + 0.2 * k, -0.2)) for k in range(3)]
     assert judged(agree + scattered + slowly).moved == [0]
+
+
+def test_none_has_moved_where_as_many_contradict_as_agree():
+    known = judged([(1, RIGHT)] + [(0, WRONG)] * 9)
+    assert known.moved == []
+    assert known.messages()[0].startswith(
+        "landmark 0: sightings contradict the map, and too few "
+    )
+    assert known.messages()[1] == "of the map not seen: landmarks 2..4"
 
 
 LOST = {"position_m": (300.0, -80.0, 0.0), "source": "map"}
@@ -196,6 +217,21 @@ def test_an_unknown_start_is_found_in_the_map(dive, kind):
             assert np.linalg.norm(e) < 0.5
 
 
+def test_a_start_that_is_found_does_not_depend_on_how_the_log_is_cut(dive):
+    lost = with_map(dive, surveyed(dive), unknown_start(dive))
+    _, seldom = run(EkfSlam, lost, rate_hz=1.0)
+    _, often = run(EkfSlam, lost, rate_hz=4.0)
+    common = [s for s in seldom if seldom[s] is not None and often.get(s) is not None]
+    assert len(common) > 50
+    for stamp in common:
+        one = seldom[stamp]
+        other = often[stamp]
+        np.testing.assert_array_equal(
+            one.world_T_body.matrix(), other.world_T_body.matrix()
+        )
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
 def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
     known = surveyed(dive)
     shuffled = np.random.default_rng(3).permutation(known.ids).tolist()
@@ -220,6 +256,19 @@ def test_three_landmarks_that_agree_are_no_start_where_most_do_not(others, is_fo
     assert (found is not None) == is_found
     if found is not None:
         np.testing.assert_allclose(found.parameters, [0.0, *t], atol=0.5)
+
+
+def test_a_third_landmark_far_from_two_others_agrees_with_their_start():
+    """Two landmarks 1 m apart leave the heading to 0.1 rad, by which a third one 40 m away is metres off."""
+    places = np.array([[0.0, 0.0, -4.0], [1.0, 0.0, -4.0], [40.0, 5.0, -4.0]])
+    known = KnownMap.of(range(3), places, sigma_m=0.05)
+    S = np.diag([0.02**2, 0.05**2])
+    errors = np.array([[0.0, 0.1], [0.0, -0.05], [0.0, 0.0]])
+    sightings = [MapSighting(i, places[i, :2] + errors[i], S) for i in range(3)]
+    found = located(sightings, known)
+    assert found is not None
+    assert found.agreeing == {0, 1, 2}
+    np.testing.assert_allclose(found.parameters[0], 0.0, atol=0.01)
 
 
 def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):
@@ -533,6 +582,30 @@ def test_a_map_of_the_same_log_is_doubted_and_one_of_another_dive_is_not(tmp_pat
     again = in_map(first, tmp_path / "map.toml")
     assert "made from the same log" in again.notes["log.warnings"]
     assert "log.warnings" not in in_map(second, tmp_path / "map.toml").notes
+
+
+def test_the_page_of_a_located_dive_shows_the_map(dive):
+    """What moved comes first; estimates are shown in the map's world, without alignment."""
+    known = surveyed(dive)
+    places = np.array(known.positions_m)
+    places[2] += [1.5, 0.5, 0.0]
+    more = KnownMap.of([*known.ids, 99], [*places, (25.0, 0.0, -2.0)], sigma_m=SIGMA_M)
+    compared = compare(with_map(dive, more, unknown_start(dive)), ["isam2", "ekf-slam"])
+    table = given_map_table(compared)
+    rows = [[cell.text for cell in row] for row in table.rows]
+    assert rows[0][0] == "3"
+    assert all(cell.endswith("moved") for cell in rows[0][3:])
+    assert [row[0] for row in rows if row[3:] == ["not seen"] * 2] == ["99"]
+    assert located_line(compared).startswith("Located in the map (star): isam2: after ")
+    smoothed = compared.runs[0].smoothed
+    assert len(smoothed) > len(compared.runs[0].causal)
+    truth = dive.true_poses.at(smoothed.stamps_ns[:5])
+    away = smoothed.positions[:5] - truth.positions
+    assert np.abs(away).max() < 0.3
+    page = render_report(compared)
+    assert 'id="show-raw" checked' in page
+    assert "map that was given" in page
+    assert "start heading" not in compared.sequence.notes.get("log.sensors", "")
 
 
 def test_the_truth_is_not_moved_to_estimates_that_a_map_has_placed(dive):

@@ -46,6 +46,11 @@ def test_windows_between_consecutive_cuts_hold_every_row_once(stamps_ns, cuts_ns
     np.testing.assert_array_equal(rows, block.z_m)
 
 
+def test_a_window_excludes_its_beginning_and_includes_its_end():
+    assert depth([10, 20, 30]).between(10, 20).stamps_ns.tolist() == [20]
+    assert depth([10, 20]).between(20, 100) is None
+
+
 @given(sorted_stamps, st.integers(0, 20))
 def test_concatenation_undoes_a_split(stamps_ns, at):
     block = depth(stamps_ns)
@@ -239,6 +244,27 @@ def test_rows_after_the_end_of_a_call_are_refused_by_name(block):
         match=rf"{type(block).__name__} has a row at 5 ns, after end_ns = 4",
     ):
         Measurements(4, **{name: block})
+
+
+def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
+    """Unknown noise (NaN) is not one of them, and of a covariance only what rounding of single precision explains."""
+    sigmas = [np.nan, 0.01, 0.0, -1.0, np.inf]
+    assert Heading(
+        np.arange(5), np.zeros(5), np.array(sigmas)
+    ).are_sound().tolist() == [True, True, *[False] * 3]
+    good = np.array([[4.0, 1.9, 0.0], [1.9, 1.0, 0.0], [0.0, 0.0, 1e8]])
+    skew = good.copy()
+    indefinite = good.copy()
+    infinite = good.copy()
+    unknown = good.copy()
+    skew[0, 1], infinite[2, 2], unknown[0, 0] = 1.8, np.inf, np.nan
+    indefinite[0, 1] = indefinite[1, 0] = 2.1
+    # indefinite, though no pair of axes is
+    cyclic = np.array([[1.0, 0.9, 0.9], [0.9, 1.0, -0.9], [0.9, -0.9, 1.0]])
+    sound = [good, 1e-9 * good, good.astype(np.float32), unknown]
+    covs = np.stack([*sound, skew, indefinite, cyclic, infinite, -good, 0 * good])
+    fixes = PositionFixes(np.arange(10), np.zeros((10, 3)), covs)
+    assert fixes.are_sound().tolist() == [True] * 4 + [False] * 6
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,16 @@ def test_start_and_end_have_both_imu_and_dvl():
     )
 
 
+@given(st.floats(0.3, 40))
+def test_instants_are_equally_spaced_inside_the_sequence(rate_hz):
+    sequence = recording()
+    instants = sequence.instants(rate_hz)
+    step_ns = round(NS_PER_S / rate_hz)
+    assert instants[0] == sequence.start_ns + step_ns
+    assert sequence.end_ns - step_ns < instants[-1] <= sequence.end_ns
+    assert set(np.diff(instants).tolist()) <= {step_ns}
+
+
 def test_sequence_shorter_than_a_step_is_refused():
     with pytest.raises(
         MeasurementError,

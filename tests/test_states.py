@@ -57,6 +57,16 @@ def test_interpolation_is_that_of_scipy():
     )
 
 
+def test_interpolation_keeps_nanoseconds_of_an_epoch():
+    path = turning(2)
+    epoch_ns = 1_700_000_000 * 10**9
+    late = Trajectory.without_covariances(
+        path.stamps_ns + epoch_ns, path.positions, path.quaternions_xyzw
+    )
+    moved_m = late.at(np.array([epoch_ns + 1])).positions[0, 0]
+    assert moved_m == pytest.approx(1e-9, rel=1e-6)
+
+
 @pytest.mark.parametrize("outside_ns", [-1, 10 * 10**9 + 1])
 def test_instants_outside_are_refused(outside_ns):
     with pytest.raises(MeasurementError, match="outside"):

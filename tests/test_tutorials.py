@@ -1,6 +1,7 @@
 """The tutorials run as they stand, and what they print is true."""
 
 import ast
+import json
 import os
 import re
 import shutil
@@ -62,6 +63,25 @@ def number_after(text: str, pattern: str) -> float:
 
 
 @pytest.mark.slow
+def test_first_comparison_finds_the_landmarks_and_writes_a_page(
+    tmp_path,
+):
+    printed = run("01_first_comparison.py", tmp_path)
+    for landmark, true in TRUE_LANDMARKS.items():
+        row = re.search(
+            rf"^ +{landmark} +(-?[\d.]+) +(-?[\d.]+) +([\d.]+)$", printed, re.MULTILINE
+        )
+        assert row, printed
+        assert float(row[1]) == pytest.approx(true[0], abs=0.3)
+        assert float(row[2]) == pytest.approx(true[1], abs=0.3)
+    page = (tmp_path / "comparison" / "report.html").read_text(encoding="utf-8")
+    for name in ("isam2", "ekf-slam", "dead-reckoning"):
+        assert number_after(printed, rf"\n{name}") < 0.5
+        assert name in page
+        assert (tmp_path / "comparison" / "runs" / name / "trajectory.tum").is_file()
+
+
+@pytest.mark.slow
 def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     printed = run("02_library.py", tmp_path)
     assert number_after(printed, r"in 10\.00 s:") == pytest.approx(0.39 * 10, abs=1.5)
@@ -79,6 +99,24 @@ def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     off_m = number_after(printed, "gap of 5 s:")
     sigma_m = number_after(printed, "1 sigma ")
     assert off_m < 3.5 * sigma_m < 0.2
+
+
+@pytest.mark.slow
+def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path):
+    printed = run("06_recogniser.py", tmp_path)
+    last = printed[printed.rindex(": landmark 3 (") :]
+    identity, certainty, range_m = re.search(
+        r"landmark (\d) \(([\d.]+)\) at ([\d.]+)", last
+    ).groups()
+    assert identity == "3"
+    assert float(certainty) > 0.9
+    assert float(range_m) == pytest.approx(
+        number_after(last, "true, of the last: landmark 3 at"), abs=0.01
+    )
+    azimuth_deg = number_after(last, "mm,")
+    assert azimuth_deg == pytest.approx(
+        number_after(last, r"true, of the last: landmark 3 at [\d.]+ m,"), abs=0.3
+    )
 
 
 @pytest.mark.slow
@@ -212,6 +250,36 @@ def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path)
         assert all(option in said for option in options), words
 
 
+EXECUTE = """
+import sys, nbclient, nbformat
+notebook = nbformat.read(sys.argv[1], as_version=4)
+nbclient.NotebookClient(notebook, timeout=500, kernel_name="python3").execute()
+nbformat.write(notebook, "executed.ipynb")
+"""
+
+
+@pytest.mark.slow
+def test_the_notebook_is_stored_without_output_and_runs(
+    tmp_path,
+):
+    pytest.importorskip(
+        "nbclient", reason="nbclient is not installed: pip install nbclient ipykernel"
+    )
+    stored = json.loads((TUTORIALS / "12_notebook.ipynb").read_text("utf-8"))
+    codes = [cell for cell in stored["cells"] if cell["cell_type"] == "code"]
+    assert all(
+        cell["outputs"] == [] and cell["execution_count"] is None for cell in codes
+    )
+    output(tmp_path, "python", "-c", EXECUTE, TUTORIALS / "12_notebook.ipynb")
+    cells = json.loads((tmp_path / "executed.ipynb").read_text("utf-8"))["cells"]
+    shown = [one.get("data", {}) for cell in cells for one in cell.get("outputs", [])]
+    tables = ["".join(one["text/html"]) for one in shown if "text/html" in one]
+    captions = [re.findall(r"<caption>(?:<span>)?(\w+)", table)[0] for table in tables]
+    assert captions == ["Sequence", "Scores", "Trajectory", "Map"]
+    assert sum("image/svg+xml" in one for one in shown) == 2
+    assert "at the same 240 instants" in "".join(cells[-1]["outputs"][0]["text"])
+
+
 @pytest.mark.slow
 def test_page_on_tables_gives_the_simulated_run(
     tmp_path,
@@ -277,8 +345,7 @@ def test_every_tutorial_is_listed_and_run():
         *TUTORIALS.glob("11*"),
     ):  # 10 is run in tests/live
         assert script.name in listed
-        # programs and notebooks are run while the site is built
-        assert script.suffix in (".py", ".ipynb") or script.name in run_here
+        assert script.name in run_here
 
 
 @pytest.mark.slow

@@ -1,18 +1,30 @@
 """Batches on real clusters. Kills at random moments, and the same through a scheduler of its own: the benchmark
 `batch_faults`, whose short version is run here."""
 
+import contextlib
+import importlib
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import psutil
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from distributed import LocalCluster
+
+from sonar_graph.batch import Limits, Where
+from sonar_graph.batch import cluster as execution
+from sonar_graph.batch.cluster import run_batch
+from sonar_graph.batch.store import PlannedRun, RunOutcome, Store
+from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
@@ -59,6 +71,24 @@ def test_faults_lose_no_run_and_change_no_number():
     )
 
 
+def test_rows_that_differ_are_told_apart_and_times_are_not_compared(
+    tmp_path, monkeypatch
+):
+    monkeypatch.syspath_prepend(str(VALIDATION))
+    faults = importlib.import_module("batch_faults")
+    tables = []
+    for number, changed in enumerate(
+        ({}, {"wall_s": 2.0}, {"causal.ate_raw_m": math.nextafter(0.1, 1)})
+    ):
+        (tmp_path / str(number)).mkdir()
+        row = {"key": "a", "causal.ate_raw_m": 0.1, "wall_s": 1.0} | changed
+        pq.write_table(
+            pa.Table.from_pylist([row]), tmp_path / str(number) / "results.parquet"
+        )
+        tables.append(faults.table(tmp_path / str(number)))
+    assert tables[0] == tables[1] != tables[2]
+
+
 def wait_for_a_run(folder: Path, process: subprocess.Popen[str]) -> None:
     """Until the first run is kept."""
     while not list(folder.glob("runs/*/row.json")):
@@ -91,6 +121,25 @@ def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
     assert not alive
     statuses = pq.read_table(tmp_path / "out" / "results.parquet")["status"].to_pylist()
     assert statuses == ["ok", "not run", "not run", "not run"]
+
+
+def test_failures_are_rows_and_the_exit_code_says_so(
+    write_suite, misbehaving, tmp_path
+):
+    failing = "".join(
+        f'[[estimators]]\nname = "{name}"\n' for name in ("sleeps", "broken", "dies")
+    )
+    suite = write_suite(HEADER, "timeout_s = 20\n", BASIN, DEAD_RECKONING, failing)
+    with bench(suite, tmp_path / "out", "--workers", "1") as process:
+        answer, said = process.communicate(timeout=300)
+    assert process.returncode == 1
+    counted = [line.split(":")[0].strip() for line in said.splitlines()]
+    assert counted == ["1 timeout", "1 failed", "1 killed"]
+    assert answer.splitlines()[0] == "Runs: 1 ok, 1 failed, 1 killed, 1 timeout"
+    rows = pq.read_table(tmp_path / "out" / "results.parquet").to_pylist()
+    assert [row["status"] for row in rows] == ["ok", "timeout", "failed", "killed"]
+    assert all(row["reason"] for row in rows[1:])
+    assert all((tmp_path / "out" / row["log_file"]).is_file() for row in rows)
 
 
 def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
@@ -127,6 +176,42 @@ def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
     assert line.endswith(
         "1 of 2 runs are done and kept; the same command goes on from there"
     )
+
+
+def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
+    planned, tmp_path, monkeypatch
+):
+    """The first batch is waiting while the second one, of the same run, fails and cancels its requests."""
+    done: list[str] = []
+    run = planned()
+
+    def told(planned_run: PlannedRun, _outcome: RunOutcome) -> None:
+        done.append(planned_run.key)
+
+    monkeypatch.setattr(execution, "perform_watched", wait_a_second)
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0"
+    ) as cluster:
+        where = Where(scheduler=cluster.scheduler_address)
+        first = threading.Thread(
+            target=run_batch,
+            args=([run], Store(tmp_path / "a"), Limits(9.0), where, told),
+        )
+        first.start()
+        time.sleep(0.5)
+        with contextlib.suppress(BatchError):
+            run_batch([run], Store(tmp_path / "b"), Limits(0.0), where, told)
+        first.join(20)
+    assert not first.is_alive()
+    assert done == [run.key]
+
+
+def wait_a_second(_run: PlannedRun, limits: Limits) -> RunOutcome:
+    """In place of a run; one without time cannot be done."""
+    if limits.timeout_s == 0:
+        raise BatchError("no time")
+    time.sleep(1.0)
+    return RunOutcome({"status": "ok"})
 
 
 def test_missing_scheduler_is_one_line(write_suite, tmp_path):

@@ -11,6 +11,7 @@ import pytest
 
 from sonar_graph.batch import Limits, supervision
 from sonar_graph.batch.supervision import Runner, perform_watched
+from sonar_graph.errors import BatchError
 
 AMPLE = Limits(600.0)
 pytestmark = pytest.mark.slow
@@ -93,6 +94,20 @@ def is_runner_of_this_test(process: psutil.Process) -> bool:
     return False
 
 
+def test_the_log_has_the_traceback_and_native_output_of_its_run_alone(
+    planned, misbehaving
+):
+    runner = Runner()
+    outcome = runner.perform(planned("prints"), AMPLE)
+    assert outcome.row["status"] == "failed"
+    assert "written by native code" in outcome.log
+    assert "RuntimeError: diverged" in outcome.log
+    assert "Traceback" in outcome.log
+    assert "runs/prints/series.npz" in outcome.files
+    assert "diverged" not in runner.perform(planned(), AMPLE).log
+    runner.end()
+
+
 def test_a_process_is_reused_within_a_package(planned, misbehaving):
     perform_watched(planned(), AMPLE)
     (kept,) = runners()
@@ -100,6 +115,19 @@ def test_a_process_is_reused_within_a_package(planned, misbehaving):
     assert runners() == [kept]
     perform_watched(planned("prints"), AMPLE)
     assert not runners()
+
+
+def test_order_of_sets_does_not_hang_on_who_started_the_process(
+    planned, misbehaving, monkeypatch
+):
+    reasons = set()
+    for seed in ("1", "2"):
+        monkeypatch.setenv("PYTHONHASHSEED", seed)
+        runner = Runner()
+        reasons.add(runner.perform(planned("sums-over-a-set"), AMPLE).row["reason"])
+        runner.end()
+    (reason,) = reasons
+    assert "mine 7" in str(reason)
 
 
 def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
@@ -124,6 +152,23 @@ def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
         "PlannedRun 600",
     ]
     assert rows[0]["causal.ate_raw_m"] == rows[1]["causal.ate_raw_m"]
+
+
+def test_a_warm_up_or_start_that_does_not_end_in_time_is_ended_and_named(
+    planned, monkeypatch
+):
+    run = planned()
+    with monkeypatch.context() as patch:
+        patch.setattr(supervision, "WARM_UP_S", 0.0)
+        row = perform_watched(run, AMPLE).row
+    assert (row["status"], row["reason"]) == ("timeout", "took longer than 0 s")
+    assert not runners()
+    monkeypatch.setattr(supervision, "START_S", 0.0)
+    with pytest.raises(
+        BatchError, match=r"no process for runs on .*: it was not ready after 0 s"
+    ):
+        Runner()
+    assert not runners()
 
 
 def test_process_of_runs_does_not_outlive_who_started_it():

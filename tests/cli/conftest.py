@@ -8,6 +8,7 @@ import pytest
 from sonar_graph.cli import main
 from sonar_graph.logs import write_log
 from sonar_graph.simulation import BasinOptions, simulate_basin
+from sonar_graph.testing import small_world
 
 Run = Callable[..., int]
 
@@ -36,4 +37,19 @@ def basin(basin_content, tmp_path) -> Path:
     """A log of a short run in the basin."""
     log = tmp_path / "basin.mcap"
     log.write_bytes(basin_content)
+    return log
+
+
+@pytest.fixture(scope="session")
+def dive_content(tmp_path_factory) -> bytes:
+    log = tmp_path_factory.mktemp("log") / "dive.mcap"
+    write_log(log, small_world())
+    return log.read_bytes()
+
+
+@pytest.fixture
+def dive(dive_content, tmp_path) -> Path:
+    """A log of 20 s, for commands that would do the same with any."""
+    log = tmp_path / "dive.mcap"
+    log.write_bytes(dive_content)
     return log

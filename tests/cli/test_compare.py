@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,9 +48,9 @@ def test_compare_writes_report_numbers_results_and_runs(compared):
 
 
 def test_compare_names_the_report_and_report_draws_it_again(
-    run, basin, tmp_path, capsys
+    run, dive, tmp_path, capsys
 ):
-    assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
+    assert run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
     told = capsys.readouterr()
     page = tmp_path / "report.html"
     assert f"Report: {page}" in told.out.splitlines()
@@ -61,8 +62,9 @@ def test_compare_names_the_report_and_report_draws_it_again(
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
 
 
-def test_names_that_are_not_utf_8_are_read_and_escaped(run, basin, tmp_path, capsys):
-    odd = basin.rename(tmp_path / "odd\udcff.mcap")
+@pytest.mark.usefixtures("unrendered")
+def test_names_that_are_not_utf_8_are_read_and_escaped(run, dive, tmp_path, capsys):
+    odd = dive.rename(tmp_path / "odd\udcff.mcap")
     assert (
         run(
             "compare",
@@ -105,8 +107,9 @@ def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(
     assert not out.exists()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_failed_run_is_written_and_reported_by_exit_code(
-    run, basin, tmp_path, monkeypatch, capsys
+    run, dive, tmp_path, monkeypatch, capsys
 ):
     from baselines.dead_reckoning import DeadReckoning
 
@@ -115,7 +118,7 @@ def test_failed_run_is_written_and_reported_by_exit_code(
 
     monkeypatch.setattr(DeadReckoning, "process", fail)
     assert (
-        run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam")
+        run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam")
         == 1
     )
     assert "the filter is tired" in capsys.readouterr().err
@@ -127,10 +130,10 @@ def test_failed_run_is_written_and_reported_by_exit_code(
     }
 
 
-def test_run_uses_the_given_calibration_field_by_field(run, basin, tmp_path):
+def test_run_uses_the_given_calibration_field_by_field(run, dive, tmp_path):
     moved = tmp_path / "moved.toml"
     moved.write_text("[start]\nposition_m = [100.0, 0.0, -1.0]\n")
-    arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
+    arguments = ("run", dive, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
     calibrations = []
     # the truth contradicts the moved start
     for more, code in ((), 0), (("--calibration", moved), 3):
@@ -183,6 +186,7 @@ def aided(sequence: Sequence, sense: float = 1.0) -> Sequence:
     return replace(sequence, heading=heading, positions=fixes)
 
 
+@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
@@ -279,3 +283,34 @@ def test_demo_drives_the_three_laps_of_the_paper_with_images():
     assert options.laps == PAPER_LAPS
     assert options.image is not None
     assert cruise_speed(options) < FASTEST_M_S
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+def test_the_documented_commands_convert_inspect_and_reckon(
+    run, recordings, tmp_path, monkeypatch, capsys
+):
+    """A pool run with a Doppler log of unknown axes: the commands and the file of the page, and no code."""
+    section = PAGE.read_text(encoding="utf-8").split("## SONIA")[1]
+    (toml,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
+    (tmp_path / "sonia.toml").write_text(toml, encoding="utf-8")
+    (tmp_path / "sonia_imu_dvl.bag").symlink_to(
+        recordings / "bags" / "sonia_imu_dvl.bag"
+    )
+    monkeypatch.chdir(tmp_path)
+    printed = []
+    for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE):
+        # the gyros' bias puts what `inspect` and `run` give in doubt
+        assert run(*line.split()) == (0 if line.startswith("convert") else 3)
+        printed.append(capsys.readouterr().out)
+    assert len(printed) == 3
+    assert re.search(
+        r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act",
+        printed[1],
+    )
+    path = np.loadtxt("sonia/runs/dead-reckoning/causal.tum")[:, 1:4]
+    assert np.all(np.ptp(path, axis=0)[:2] < 5), "the vehicle stays in the pool"
+    assert 35 < np.linalg.norm(np.diff(path, axis=0), axis=1).sum() < 50

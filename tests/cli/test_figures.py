@@ -1,9 +1,12 @@
 """``sonar-graph figures``: what a paper takes of a result."""
 
+import pytest
+
 from sonar_graph.report import write_report
 from tests.synthetic import basin_comparison
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(run, tmp_path, capsys):
     result = write_report(basin_comparison(60), tmp_path / "result").parent
     assert run("figures", result) == 0

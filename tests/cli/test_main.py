@@ -35,8 +35,9 @@ def test_no_argument_shows_the_commands(run, capsys):
         assert path[0] in shown
 
 
-def test_help_loads_nothing_heavy(run, basin, tmp_path):
-    run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning")
+@pytest.mark.usefixtures("unrendered")
+def test_help_loads_nothing_heavy(run, dive, tmp_path):
+    run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning")
     heavy = {"gtsam", "matplotlib", "numba", "numpy", "scipy"}
     cache = tmp_path / "cache"
     park = ["convert", "dataset", "victoria-park", "-o", str(tmp_path / "park.mcap")]

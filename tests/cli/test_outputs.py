@@ -41,34 +41,34 @@ CONVERSIONS = [f"convert {kind}" for kind in ("rosbag", "didson", "aris", "oculu
     "command", [*CONVERSIONS, "recognise", "simulate landmarks --on"]
 )
 def test_a_log_made_from_a_file_never_replaces_it(
-    command, flags, basin, run, tmp_path, capsys
+    command, flags, dive, run, tmp_path, capsys
 ):
-    before = basin.read_bytes()
-    for output in (basin, tmp_path / "." / basin.name, *links(basin, tmp_path)):
-        assert run(*command.split(), basin, "-o", output, *flags) == 2
+    before = dive.read_bytes()
+    for output in (dive, tmp_path / "." / dive.name, *links(dive, tmp_path)):
+        assert run(*command.split(), dive, "-o", output, *flags) == 2
         assert re.fullmatch(
             r"sonar-graph: \S+: is what is read, .*choose another name.*\n",
             capsys.readouterr().err,
         )
-    assert basin.read_bytes() == before
+    assert dive.read_bytes() == before
 
 
 def test_a_part_of_a_bag_or_a_log_of_another_ending_is_not_overwritten(
-    basin, run, tmp_path, capsys
+    dive, run, tmp_path, capsys
 ):
     part = tmp_path / "bag" / "bag_0.mcap"
     model = tmp_path / "log.json"
-    contents = foreign_log(part), basin.read_bytes()
-    model.hardlink_to(basin)
+    contents = foreign_log(part), dive.read_bytes()
+    model.hardlink_to(dive)
     rosbag = ("convert", "rosbag", part.parent, "-o", part, "--overwrite")
     for command in (
         rosbag,
-        ("calibrate", basin, "-o", model),
-        ("label", basin, "-o", model),
+        ("calibrate", dive, "-o", model),
+        ("label", dive, "-o", model),
     ):
         assert run(*command) == 2
         assert "is what is read" in capsys.readouterr().err
-    assert (part.read_bytes(), basin.read_bytes()) == contents
+    assert (part.read_bytes(), dive.read_bytes()) == contents
 
 
 @pytest.mark.parametrize(
@@ -80,11 +80,11 @@ def test_a_part_of_a_bag_or_a_log_of_another_ending_is_not_overwritten(
         "runs/dead-reckoning/trajectory.tum",
     ],
 )
-def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
+def test_results_never_overwrite_the_log(name, dive, run, tmp_path, capsys):
     log = tmp_path / "results" / name
     log.parent.mkdir(parents=True)
-    before = basin.read_bytes()
-    basin.rename(log)
+    before = dive.read_bytes()
+    dive.rename(log)
     for given in (log, *links(log, tmp_path)):
         for command, options in (
             ("compare", QUICK),
@@ -99,15 +99,15 @@ def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
 
 
 def test_results_never_overwrite_settings_or_a_log_of_another_program(
-    basin, run, tmp_path
+    dive, run, tmp_path
 ):
     settings = tmp_path / "comparison.json"
     settings.write_text("{}")
     for option in ("--calibration", "--log-config"):
-        assert run("compare", basin, "-o", tmp_path, option, settings, *QUICK) == 2
+        assert run("compare", dive, "-o", tmp_path, option, settings, *QUICK) == 2
     assert settings.read_text() == "{}"
     for path, command in (
-        ("a/result.mcap", ("compare", basin, *QUICK)),
+        ("a/result.mcap", ("compare", dive, *QUICK)),
         ("b/basin.mcap", ("demo",)),
     ):
         before = foreign_log(tmp_path / path)
@@ -115,13 +115,14 @@ def test_results_never_overwrite_settings_or_a_log_of_another_program(
         assert (tmp_path / path).read_bytes() == before
 
 
-def test_a_comparison_beside_the_log_can_be_repeated(basin, run, tmp_path):
-    before = basin.read_bytes()
+@pytest.mark.usefixtures("unrendered")
+def test_a_comparison_beside_the_log_can_be_repeated(dive, run, tmp_path):
+    before = dive.read_bytes()
     for _ in range(2):
-        assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
-    assert basin.read_bytes() == before
+        assert run("compare", dive, "-o", tmp_path, *QUICK) == 0
+    assert dive.read_bytes() == before
     written = {path for path in tmp_path.rglob("*") if path.is_file()} - {
-        basin,
+        dive,
         tmp_path / LOCK,
         tmp_path / MANIFEST,
     }
@@ -178,7 +179,8 @@ def test_commands_can_be_repeated_over_what_they_wrote(run, tmp_path, capsys):
     assert (tmp_path / "link.mcap").stat().st_size > 0
 
 
-def test_a_refused_command_leaves_no_new_folder(run, basin, tmp_path):
+@pytest.mark.usefixtures("unrendered")
+def test_a_refused_command_leaves_no_new_folder(run, dive, tmp_path):
     unreadable = tmp_path / "words.mcap"
     there = tmp_path / "there"
     unreadable.write_text("words")
@@ -188,7 +190,7 @@ def test_a_refused_command_leaves_no_new_folder(run, basin, tmp_path):
         assert (
             run(
                 "run",
-                basin,
+                dive,
                 "-o",
                 place,
                 "--estimator",
@@ -202,9 +204,9 @@ def test_a_refused_command_leaves_no_new_folder(run, basin, tmp_path):
             run("convert", "mrclam", tmp_path, "--robot", "1", "-o", place / "log.mcap")
             == 2
         )
-        assert {basin, unreadable, there} == set(tmp_path.iterdir())
+        assert {dive, unreadable, there} == set(tmp_path.iterdir())
         assert not list(there.iterdir())
-    assert run("compare", basin, "-o", tmp_path / "made" / "below", *QUICK) == 0
+    assert run("compare", dive, "-o", tmp_path / "made" / "below", *QUICK) == 0
 
 
 OURS = [
@@ -221,9 +223,10 @@ THEIRS = [
 ]
 
 
+@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize("ours", [None, *OURS])
 def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
-    ours, basin, run, tmp_path, capsys
+    ours, dive, run, tmp_path, capsys
 ):
     folder = tmp_path / "out"
     mine = [folder / name for name in [*THEIRS, *([ours] if ours else [])]]
@@ -231,8 +234,8 @@ def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("mine")
     for command in (
-        ("compare", basin, *QUICK),
-        ("run", basin, "--estimator", "dead-reckoning"),
+        ("compare", dive, *QUICK),
+        ("run", dive, "--estimator", "dead-reckoning"),
     ):
         assert run(*command, "-o", folder) == (2 if ours else 0)
         assert (

@@ -222,6 +222,7 @@ def test_tables_with_another_unit_of_velocity_are_reported(
     assert "unit" not in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize("command", ["run", "compare"])
 def test_velocities_a_thousand_times_too_large_come_first(
     run, folder, tmp_path, command, capsys
@@ -233,6 +234,7 @@ def test_velocities_a_thousand_times_too_large_come_first(
     assert "`scale = 0.001` under [dvl]" in said
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_start_that_nobody_stated_is_said_and_errors_are_after_the_fit(
     run, folder, tmp_path, capsys
 ):

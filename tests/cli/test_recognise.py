@@ -107,6 +107,7 @@ def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, ca
     assert not np.allclose(one.id_probability[mine], other.id_probability[its])
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_compare_recognises_by_itself_and_gives_what_recognise_gives(
     lane_log, recognised, run, tmp_path, capsys
 ):

@@ -73,6 +73,17 @@ def test_few_outliers_change_nothing_and_many_do(share: float, is_found: bool):
     assert (abs(found.gain.value - 1.0) < 0.02) == is_found
 
 
+@pytest.mark.parametrize(
+    ("count", "left"), [(len(T) // 4, 3 * len(T) // 4), (len(T) // 4 + 1, len(T))]
+)
+def test_up_to_a_quarter_of_the_rows_is_left_out(count: int, left: int):
+    """Where more rows are far, the model is wrong, and all rows stay."""
+    y = wave(T) + noise(4)
+    y[:count] += 20.0 * (-1.0) ** np.arange(count)
+    fit = RobustFit.of(wave(T)[None, :, None], SignalStretch(T, y, wave), 0.0)
+    assert fit.kept.sum() == left
+
+
 def test_intervals_cover_the_truth_with_correlated_errors():
     """Of 100 logs 95 % intervals hold 90 or more; sigmas by independent rows would hold far fewer."""
     held = 0

@@ -177,6 +177,26 @@ def opened(
 
 
 @needs_browser
+@pytest.mark.parametrize("name", OPENED)
+def test_nothing_is_said_in_the_console_and_nothing_sticks_out(browser, name):
+    for width in (PHONE, DESKTOP):
+        with opened(browser, name, width) as (page, said):
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert said == []
+
+
+@needs_browser
+def test_a_page_that_is_wrong_is_found(browser, tmp_path):
+    broken = tmp_path / "broken.html"
+    broken.write_text(
+        '<html><body><script>nothing();</script><div style="width: 3000px">wide</div></body></html>'
+    )
+    with opened(browser, str(broken), PHONE) as (page, said):
+        assert page.evaluate("document.documentElement.scrollWidth") > PHONE
+        assert any("nothing is not defined" in line for line in said)
+
+
+@needs_browser
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -213,6 +233,17 @@ def test_axe_finds_nothing_serious(browser, name):
     for width, scheme in ((PHONE, "light"), (DESKTOP, "dark")):
         with opened(browser, name, width, scheme) as (page, _):
             assert serious(page) == []
+
+
+@needs_browser
+@pytest.mark.skipif(
+    not AXE.is_file(),
+    reason="no axe-core: npm install axe-core, or set SONAR_GRAPH_AXE",
+)
+def test_axe_finds_a_picture_without_a_description(browser):
+    with opened(browser, "index.html", DESKTOP) as (page, _):
+        page.evaluate("document.querySelector('article img').removeAttribute('alt')")
+        assert any("image-alt" in one for one in serious(page))
 
 
 def serious(page: Any) -> list[str]:

@@ -133,6 +133,7 @@ def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
     ]
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_no_page_of_an_earlier_comparison_stays_beside_later_numbers(
     comparison, tmp_path
 ):

@@ -170,6 +170,18 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
     assert_equals_log(outcome, tmp_path, 150)
 
 
+def test_a_sender_that_ends_is_missed(tmp_path, endpoint, messages, monkeypatch):
+    monkeypatch.setattr(inbox, "SILENT_S", 0.5)
+    outcome, _, said = lived(
+        tmp_path,
+        endpoint,
+        Robot(endpoint, [m for m in messages if at_s(messages, m) < 10]),
+    )
+    missed = [line.partition(":")[0] for line in said if ": nothing since " in line]
+    assert {"/imu/data", "/dvl/data"} <= set(missed)
+    assert_equals_log(outcome, tmp_path, 50)
+
+
 def test_a_clock_that_is_set_ahead_by_a_minute_costs_messages_by_name_only(
     tmp_path, endpoint, messages
 ):
@@ -191,6 +203,16 @@ def test_a_clock_that_is_set_ahead_by_a_minute_costs_messages_by_name_only(
     assert_equals_log(outcome, tmp_path, 100)
 
 
+def test_a_burst_at_ten_times_the_pace_loses_nothing(tmp_path, endpoint, messages):
+    robot = Robot(
+        endpoint, messages, pace_at=lambda at_s: 10 * PACE if 8 < at_s < 14 else PACE
+    )
+    outcome, counts, _ = lived(tmp_path, endpoint, robot)
+    assert not counts["lost"]
+    assert sum(counts["received"].values()) == len(messages)
+    assert_equals_log(outcome, tmp_path, 150)
+
+
 def test_after_a_router_that_restarts_the_run_goes_on(tmp_path, endpoint, messages):
     robot = Robot(endpoint, messages, breaks_at_s=10.0)
     outcome, counts, _ = lived(tmp_path, endpoint, robot)
@@ -198,6 +220,40 @@ def test_after_a_router_that_restarts_the_run_goes_on(tmp_path, endpoint, messag
     # what was sent while it looked for the router is missing
     assert received > 0.9 * len(messages)
     assert outcome.causal.stamps_ns[-1] - outcome.causal.stamps_ns[0] > 18 * SECOND
+    assert_equals_log(outcome, tmp_path, 150)
+
+
+def test_a_viewer_that_stalls_delays_nobody(tmp_path, endpoint, messages):
+    """A subscriber that is stopped does not hold up poses for another, nor the run."""
+    arrived = []
+
+    def listener(where):
+        viewer = subprocess.Popen(
+            [sys.executable, "-c", STALLED, where], stdout=subprocess.PIPE, text=True
+        )
+        assert viewer.stdout.readline() == "listening\n"
+        viewer.send_signal(signal.SIGSTOP)
+        session = open_session([where])
+        subscriber = session.declare_subscriber(
+            "0/sonar_graph/odometry/**",
+            lambda s: arrived.append((time.monotonic(), s.payload.to_bytes())),
+        )
+        stalled.append((viewer, session, subscriber))
+        return subscriber
+
+    stalled = []
+    try:
+        outcome, counts, _ = lived(
+            tmp_path, endpoint, Robot(endpoint, messages), listener
+        )
+    finally:
+        for viewer, session, _ in stalled:
+            viewer.kill()
+            viewer.communicate()
+            session.close()
+    assert not counts["lost"]
+    assert len(arrived) > 500
+    assert max(np.diff([at for at, _ in arrived])) < 2.0
     assert_equals_log(outcome, tmp_path, 150)
 
 

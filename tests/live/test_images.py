@@ -35,6 +35,34 @@ def log(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("knows_floor", [False, True])
+def test_who_recognises_live_without_a_height_over_the_floor_is_told(
+    tmp_path, log, knows_floor
+):
+    given = (
+        PartialCalibration.parse({"floor": {"z_m": 0.0, "sigma_m": 0.02}}, "a test")
+        if knows_floor
+        else None
+    )
+    messages = messages_of(log, np.random.default_rng(0), 0.0)
+    said = []
+    options = LiveOptions("dead-reckoning", calibration=given)
+    with (
+        LiveRecord(tmp_path / "record.mcap") as record,
+        LiveRun(record, definition_of, options, [], said.append) as run,
+    ):
+        for message in messages:
+            if message.arrival_ns > messages[0].arrival_ns + 4 * 10**9:
+                break
+            if message.topic != "/sonar/landmarks":
+                run.accept(message)
+                run.turn(0.0)
+    assert sum("floor" in line and "plane of the image" in line for line in said) == (
+        not knows_floor
+    )
+
+
+@pytest.mark.slow
 def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path, log):
     """Each image is waited for; the images of the first two seconds, before the recogniser begins, are missing."""
     whole = recognise(log)

@@ -272,6 +272,20 @@ def write(
     return written
 
 
+def write_apart(path: Path, count: int = 100) -> None:
+    """/a and /b in chunks of their own, by turns, a second apart from second 1 on; /tf_static is in the first chunk."""
+    with writing(path) as writer:
+        kinds = {"/a": "A", "/b": "B", "/tf_static": "Static"}
+        channels = [
+            channel_for(writer, name, f"test_msgs/msg/{kind}")
+            for name, kind in kinds.items()
+        ]
+        writer.add_message(channels[2], 10**9, b"static", 10**9)
+        for i in range(count):
+            writer.add_message(channels[i % 2], (1 + i) * 10**9, bytes([i]), 10**9)
+            writer.flush()
+
+
 def entries(topic: Topic) -> list[Stored]:
     """Log times and payloads, in order."""
     stacks = [part for stack in topic.stacks.values() for part in stack]

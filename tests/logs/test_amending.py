@@ -164,6 +164,18 @@ def test_existing_topics_are_refused_unless_they_are_replaced(
         write_amended(source, source, [])
 
 
+def test_a_damaged_attachment_is_left_out_and_named(tmp_path):
+    source = foreign_log(tmp_path / "a.mcap")
+    (tmp_path / "bad.mcap").write_bytes(
+        source.read_bytes().replace(b"of the dive", b"of the dove")
+    )
+    amended = write_amended(
+        tmp_path / "bad.mcap", tmp_path / "b.mcap", [], salvage=True
+    )
+    assert "damaged and left out" in amended.notes["log.attachments"]
+    assert content(tmp_path / "b.mcap")["attachments"] == []
+
+
 def test_messages_in_pieces_are_merged_under_a_new_topic(
     tmp_path,
 ):

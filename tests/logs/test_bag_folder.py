@@ -10,7 +10,7 @@ from mcap.writer import Writer
 from sonar_graph.errors import LogError
 from sonar_graph.live import recorded_messages
 from sonar_graph.logs import inspect_log, read_log, write_log
-from sonar_graph.logs.mcap import Keep, log_parts, scan, stream
+from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, log_parts, scan, stream
 from sonar_graph.testing import small_world
 
 METADATA = """rosbag2_bagfile_information:
@@ -123,6 +123,19 @@ def test_a_folder_is_the_single_file(whole, folder, is_listed):
         expected.warnings,
     )
     assert list(recorded_messages(folder)) == list(recorded_messages(whole))
+
+
+def test_a_part_of_the_time_is_counted_from_the_first_file(whole, folder):
+    for window in (TimeWindow.parse("5", "12.5"), TimeWindow(Instant(seconds=14.0))):
+        one, several = (
+            scan(path, lambda _: Keep.ALL, window) for path in (whole, folder)
+        )
+        assert several.part == one.part or "of the recording" in several.part
+        assert {n: len(t) for n, t in several.topics.items()} == {
+            n: len(t) for n, t in one.topics.items()
+        }
+    with pytest.raises(LogError, match=r"dive: nothing was recorded from"):
+        scan(folder, lambda _: Keep.ALL, TimeWindow.parse("50", None))
 
 
 def cut(path: Path) -> None:

@@ -1,6 +1,8 @@
 """ROS 2 messages as columns: against two other libraries, by hand, and where payloads or definitions are broken."""
 
 import struct
+import time
+from itertools import combinations, islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -249,3 +251,46 @@ def test_no_bytes_crash_and_what_is_sound_is_what_another_library_reads(
         assert group["flags"][0].tolist() == theirs.flags
         np.testing.assert_array_equal(group["values"][0], theirs.values)
         assert group["last"].tolist() == [theirs.last]
+
+
+# four strings of together 256 bytes
+CUTS = [(0, *cuts, 64) for cuts in islice(combinations(range(1, 64), 3), 12_000)]
+
+
+LENGTHS = [[4 * (b - a) for a, b in pairwise(cuts)] for cuts in CUTS]
+
+
+NAMES = parsed("string[4] names")
+
+
+ENDLESS = parsed("P[4000000000] points", P="string s")
+
+
+MANY: dict[str, tuple[Struct, list[bytes]]] = {
+    "cut": (DEFINITION, [whole()[:45]] * 21_000),
+    "an array without end": (
+        ENDLESS,
+        [START + bytes(80)],
+    ),  # found out before it is walked
+    "one layout each": (
+        NAMES,
+        [
+            START + b"".join(struct.pack(f"<I{n}s", n, b"x" * (n - 1)) for n in lengths)
+            for lengths in LENGTHS
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize(("definition", "payloads"), MANY.values(), ids=MANY)
+def test_many_broken_messages_are_read_in_seconds(
+    definition: Struct, payloads: list[bytes]
+) -> None:
+    stacks = stacked(payloads)
+    start = time.process_time()
+    decoded = decode(definition, stacks)
+    assert time.process_time() - start < 3.0
+    assert definition is not NAMES or (len(stacks), len(decoded.groups)) == (1, 12_000)
+    assert definition is not ENDLESS or list(decoded.unsound) == [
+        "that end before their definition does"
+    ]

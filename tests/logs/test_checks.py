@@ -30,8 +30,8 @@ from sonar_graph.logs.checks import (
     stuck_warning,
     unlikely_zeros,
 )
-from sonar_graph.logs.reading import require_use
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu
+from sonar_graph.logs.reading import require_use, unsaid_noise
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
 
 PINGS = np.arange(1500) * 0.2
 SAMPLES = np.arange(30000) * 0.01
@@ -66,6 +66,10 @@ def without(times_s: Floats, *spans_s: tuple[float, float]) -> Floats:
 
 GUESS = "the turn in between is guessed from the rates before and after"
 USUAL = Calibration()
+
+
+SHORT = Calibration(dvl=DvlCalibration(gap_s=1.5))
+
 STILL = Calibration(imu=ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0)))
 HELD = Calibration(odometry_interpolation="hold-past")
 HOLED = imu(without(SAMPLES, (100, 110)))
@@ -119,6 +123,20 @@ def test_each_gap_is_named_with_its_times_and_the_assumption_in_it(
     assert all(
         text.startswith(start) for text, start in zip(found, expected, strict=True)
     )
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "first_s", "is_told"), [(1.4, 0.9, False), (1.6, 1.1, True)]
+)
+def test_a_gap_begins_at_its_limit(gap_s: float, first_s: float, is_told: bool) -> None:
+    later = np.concatenate([PINGS[:500], PINGS[500:] - 0.2 + gap_s])
+    for inertial, doppler, calibration in (
+        (imu(SAMPLES[1000:20001]), dvl(10.0 + gap_s + PINGS[:951]), USUAL),
+        (imu(SAMPLES[1000:20001]), dvl(10.0 - gap_s + PINGS[:951]), USUAL),
+        (imu(), dvl(later), SHORT),
+        (imu(np.concatenate([[0.0], first_s + SAMPLES])), dvl(), USUAL),
+    ):
+        assert any(gap_warnings(inertial, doppler, calibration)) == is_told
 
 
 # --- stamps ---------------------------------------------------------------------------------------------------------
@@ -201,6 +219,25 @@ def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -
     )
     assert (found or "").startswith(expected or "")
     assert (found is None) == (expected is None)
+
+
+def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
+    rng = np.random.default_rng(4)
+    stamps_ns = EVEN[0] + np.arange(1500) * SECOND // 5
+    way = 0.5 * (stamps_ns - stamps_ns[0]) * 1e-9
+    fine = 3.0 + np.cumsum(0.003 * rng.standard_normal(1500))[:, None]
+    for step_m, hangs_s in ((1e-4, 5.0), (0.01, 60.0)):
+        height = np.round(fine / step_m) * step_m
+        assert stuck_warning(stamps_ns, height, "height", way) is None
+        height[500 : 500 + round(5 * hangs_s)] = height[500]
+        assert "height the same to the last bit" in (
+            stuck_warning(stamps_ns, height, "height", way) or ""
+        )
+    # a vehicle that rests has one depth, but for the resolution
+    assert stuck_warning(stamps_ns, height, "height", 0.04 * way) is None
+    assert "in 1500 rows" in (
+        stuck_warning(stamps_ns, 0 * fine + 3.0, "height", way) or ""
+    )
 
 
 def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:
@@ -309,6 +346,30 @@ def test_measurements_with_which_no_estimator_could_begin_are_refused() -> None:
         match=r"log\.mcap: DVL: none of its 5 rows measures a velocity in all directions",
     ):
         require_use("log.mcap", imu(five), dvl(five, True))
+
+
+def test_rows_that_do_not_say_their_noise_are_counted() -> None:
+    five = np.arange(5.0)
+    doppler = dvl(five)
+    depth = Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
+    known = np.tile(np.eye(2), (5, 1, 1))
+    ones = np.ones((5, 1))
+    detections = LandmarkDetections(
+        stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones
+    )
+    blocks = {"dvl": doppler, "depth": depth, "heading": None, "detections": detections}
+    assert list(unsaid_noise(blocks)) == []
+    doppler.velocity_cov[1:3, 2, 2] = depth.variance_m2[
+        0
+    ] = detections.range_azimuth_cov[:] = np.nan
+    assert list(unsaid_noise(blocks)) == [
+        "dvl: 2 of 5 rows say no covariance, dvl.velocity_sigma_m_s of the calibration count",
+        "depth: 1 of 5 rows say no covariance, depth.sigma_m of the calibration count",
+        "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",
+    ]
+    assert [
+        text.partition(":")[0] for text in unsaid_noise(blocks, only_partly=True)
+    ] == ["dvl", "depth"]
 
 
 def rates(seed: int, clip: float = np.inf, dead: int | None = None, step: float = 0.0):

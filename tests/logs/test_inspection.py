@@ -21,8 +21,10 @@ from sonar_graph.logs import (
     write_log,
 )
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.convert import read_victoria_park
 from sonar_graph.logs.mcap import Keep, scan
 from sonar_graph.logs.roles import choose_topic, refusal
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 from .conftest import Bench, channel_for, chunk_indexes, flip, writing
 
@@ -91,6 +93,52 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
     # by the robot's clock, not the recorder's
     assert summary.duration_s == pytest.approx(101.394)
     assert summary.damage == ()
+
+
+def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> None:
+    imu, _ = bench.basics()
+    sideways = [
+        message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}}
+        for message in imu[2]
+    ]
+    sideways[0] |= {"header": bench.imu(0)["header"]}
+    dvl = (
+        "/dvl",
+        "dvl",
+        [
+            bench.dvl(bench.t0_ns + i * 10**8, velocity_mode=1 + (i == 2))
+            for i in range(5)
+        ],
+    )
+    path = bench.write(("/imu", "imu", sideways), dvl)
+    summary = inspect_log(path)
+    notes = read_log(path).notes
+    assert summary.left_out == ("dvl: 1 with velocity_mode not 1",)
+    assert "; ".join(summary.left_out) == notes["log.dropped"]
+    told = (notes["log.doubtful"], notes["log.warnings"])
+    assert "; ".join(summary.warnings) == "; ".join(told)
+    assert any("gravity is felt along +y" in warning for warning in summary.warnings)
+    faults = {topic.name: topic.stamp_faults for topic in summary.topics}
+    assert faults["/dvl"] == ()
+    assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
+
+
+def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
+    write_log(tmp_path / "a.mcap", read_victoria_park())
+    write_log(
+        tmp_path / "b.mcap",
+        simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)),
+    )
+    for name in ("a.mcap", "b.mcap"):
+        summary = inspect_log(tmp_path / name)
+        assert summary.warnings == ()
+        assert [
+            topic.stamp_faults for topic in summary.topics if topic.stamp_faults
+        ] == []
+        assert summary.damage == ()
+        assert (
+            not {"log.stamps", "log.warnings"} & read_log(tmp_path / name).notes.keys()
+        )
 
 
 # --- topics that cannot be read, and broken messages -----------------------------------------------------------------

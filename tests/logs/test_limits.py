@@ -1,7 +1,9 @@
 """Reading ends, in time and memory that a log's size allows, whatever a file claims."""
 
+import contextlib
 import os
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
 from sonar_graph.logs import PartialCalibration, inspect_log, read_log
+from sonar_graph.logs.cdr import parse_definition
 from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
 from sonar_graph.logs.roles import TF
@@ -70,6 +73,22 @@ def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
         assert "mcap compress" in loss.reason
     else:
         assert "is lost" in loss.reason
+
+
+def test_messages_far_larger_than_their_file_are_refused(
+    tmp_path: Path, monkeypatch: Any, make_sequence: Any
+) -> None:
+    write_recording(
+        tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {}
+    )
+    size = (tmp_path / "log.mcap").stat().st_size
+    monkeypatch.setattr(scanning, "LARGEST_BYTES", 10)
+    scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+    monkeypatch.setattr(scanning, "LARGEST_RATIO", 1 / size)
+    with pytest.raises(
+        LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"
+    ):
+        scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
@@ -141,3 +160,24 @@ def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
     assert read_log(
         path, calibration=stated
     ).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
+
+
+SLOW: dict[str, str] = {
+    "line feeds": "float64 a\n" + "=" * 80 + "\n" * 300_000 + "x",
+    "separators": ("=" * 80 + "\n") * 12_000,
+    "spaces": "float64 a" + " " * 900_000,
+    "fields": "\n".join(f"float64 f{i}" for i in range(60_000)),
+    "an array": f"float64[{'9' * 5000}] a",
+}
+
+
+@pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
+def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(
+    text: str,
+) -> None:
+    began = time.process_time()
+    for kind in ("p/msg/A", "p/msg/B"):
+        for _ in range(5):
+            with contextlib.suppress(LogError):
+                parse_definition(kind, text)
+    assert time.process_time() - began < 2.0

@@ -17,8 +17,9 @@ from mcap.records import Chunk, ChunkIndex, Message
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, IndexType
 
-from sonar_graph.errors import LogError
-from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, scan, stream
+from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.logs import read_log
+from sonar_graph.logs.mcap import Damage, Instant, Keep, TimeWindow, scan, seal, stream
 
 from .conftest import (
     Stored,
@@ -28,6 +29,8 @@ from .conftest import (
     read,
     scan_all,
     write,
+    write_apart,
+    writing,
 )
 
 NONE = CompressionType.NONE
@@ -339,6 +342,93 @@ def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
     assert "whose description is lost" in recording.corrupt[1]
 
 
+def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
+    path: Path,
+) -> None:
+    for options, named in (
+        (
+            {"use_chunking": False},
+            "messages lie outside chunks, metadata record 'sonar_graph'",
+        ),
+        (
+            {"enable_crcs": False},
+            "12 chunks carry no CRC, metadata record 'sonar_graph'",
+        ),
+        ({}, "metadata record 'sonar_graph'"),
+    ):
+        write(path, **options)
+        assert scan_all(path).notes() == {"log.unprotected": named}
+    written = write(path, use_chunking=False, enable_data_crcs=True)
+    assert scan_all(path).damage == Damage()
+    at_text(written[200][1], 3)(path)
+    (loss,) = scan_all(path).damage.losses
+    assert (
+        "the CRC over all data does not fit, and messages lie outside chunks"
+        in loss.reason
+    )
+    with writing(path) as writer:
+        writer.add_metadata("sonar_graph", seal({"calibration": "0.05", "name": "x"}))
+    recording = scan_all(path)
+    assert recording.metadata == {"sonar_graph": {"calibration": "0.05", "name": "x"}}
+    assert recording.damage == Damage()
+    at_text(b"0.05", 3)(path)
+    recording = scan_all(path)
+    assert recording.metadata == {}
+    assert "a metadata record is lost: its CRC does not fit" in recording.corrupt[0]
+
+
+def test_a_truncated_file_is_read_up_to_the_cut(
+    path: Path,
+) -> None:
+    written = write(path)
+    chunks = chunk_indexes(path)
+    content = path.read_bytes()
+    for kept in (0.3, 0.6, 0.8):
+        path.write_bytes(content[: int(len(content) * kept)])
+        found = read(path)
+        recording = scan_all(path)
+        assert 0 < len(found) < len(written)
+        assert found == written[: len(found)]
+        assert re.search(
+            r"^the file is cut off: .* spans 0\.000 s$", recording.ending or ""
+        )
+        recording.require_sound()
+    path.write_bytes(content[: chunk_end(chunks[-1])])
+    assert (scan_all(path).ending or "").startswith(
+        "the file is cut off: it ends after a whole record"
+    )
+    flip(path, chunks[-1].chunk_start_offset + 1)  # the outer length of the last chunk
+    assert read(path) == written
+    path.write_bytes(content[: chunks[0].chunk_start_offset + 3])
+    assert re.search(
+        r"^the file is cut off: .*; no message is there$", scan_all(path).ending or ""
+    )
+    with pytest.raises(
+        MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "
+    ):
+        read_log(path)
+
+
+@pytest.mark.parametrize("compression", [ZSTD, LZ4, NONE])
+def test_half_a_chunk_gives_its_whole_messages(
+    path: Path, compression: CompressionType
+) -> None:
+    written = write(path, 12_000, chunk_size=1 << 18, compression=compression)
+    second = chunk_indexes(path)[1]
+    before = int(
+        np.searchsorted([time for time, _ in written], second.message_start_time)
+    )
+    path.write_bytes(
+        path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2]
+    )
+    found = read(path)
+    assert found == written[: len(found)]
+    assert len(found) > before + 0.2 * before
+    ending = scan_all(path).ending or ""
+    assert "which no CRC covers" in ending
+    assert ending.endswith(f"what is there spans {(found[-1][0] - 1000) * 1e-9:.3f} s")
+
+
 # ---- files that are cut off
 
 
@@ -398,6 +488,26 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
     ):
         with pytest.raises(LogError, match=kind):
             scan_all(path)
+
+
+def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -> None:
+    write_apart(path)
+    recording = scan_all(path, TimeWindow(Instant.parse("10"), Instant.parse("20")))
+    times_s = sorted(
+        t
+        for name in ("/a", "/b")
+        for t in (recording.topics[name].log_times_ns // 10**9).tolist()
+    )
+    assert times_s == list(range(11, 21))
+    assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
+    assert recording.skipped_chunks == 89
+    assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
+    absolute = TimeWindow(Instant.parse("1970-01-01T00:01:31Z"))
+    assert sum(len(t) for t in scan_all(path, absolute).topics.values()) == 11
+    with pytest.raises(
+        LogError, match=r"nothing was recorded from 1000\.000 s to the end"
+    ):
+        scan_all(path, TimeWindow(Instant.parse("1000")))
 
 
 # ---- parts of a file

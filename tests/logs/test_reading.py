@@ -203,6 +203,41 @@ def detected(bench: Bench, *frames: dict[str, Any]) -> Path:
     return bench.write(*bench.basics(), ("/landmarks", "detections", list(frames)))
 
 
+def test_detections_are_padded_and_keep_their_tracks(
+    bench: Bench,
+) -> None:
+    """Also when messages of one log differ in having tracks."""
+    frames = [
+        bench.detections(T0_NS, [1.0, 2.0], [5, 6], (4, 3)),
+        bench.detections(T0_NS + 1, [], []),
+        bench.detections(T0_NS + 2, [3.0], [7, 8, 9]),
+        bench.detections(T0_NS + 3, [np.nan, 4.0], [1, 2], (9, -1)),
+        bench.detections(T0_NS + 4, [6.0], [5], (7,)),
+    ]
+    found = read_log(detected(bench, *frames)).detections
+    assert found is not None
+    assert (found.stamps_ns - T0_NS).tolist() == [0, 0, 2, 3, 4]
+    assert found.range_m.tolist() == [1, 2, 3, 4, 6]
+    assert found.candidate_ids.tolist() == [
+        [5, -1, -1],
+        [6, -1, -1],
+        [7, 8, 9],
+        [2, -1, -1],
+        [5, -1, -1],
+    ]
+    assert found.id_probability[0].tolist() == [0.5, 0, 0]
+    np.testing.assert_array_equal(found.range_azimuth_cov[0], [[0.01, 0], [0, 0.02]])
+    assert found.track.tolist() == [4, 3, -1, -1, 7]
+    # logs older than tracks
+    lines = definition("sonar_graph_msgs/msg/LandmarkDetections").splitlines(
+        keepends=True
+    )
+    old = "".join(line for line in lines if "track" not in line)
+    frame = {key: value for key, value in frames[0].items() if key != "track"}
+    path = bench.write(*bench.basics(), ("/landmarks", "detections", [frame], old))
+    assert read_log(path).detections.track.tolist() == [-1, -1]  # type: ignore[union-attr]
+
+
 def one_of(bench: Bench, **changed: Any) -> Path:
     """A log with a sound frame of one detection, and a changed one of two."""
     frames = [

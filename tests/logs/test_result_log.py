@@ -1,6 +1,7 @@
 """Results, their messages and layouts for viewers, as other libraries decode them."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,6 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -22,6 +25,7 @@ from sonar_graph.logs import (
     write_result,
 )
 from sonar_graph.logs.mcap import Outgoing, write_recording
+from sonar_graph.logs.result_log import source_names
 from sonar_graph.logs.viewer_messages import (
     GREY,
     Layer,
@@ -181,6 +185,21 @@ def test_rosbags_re_encodes_every_message_to_the_same_bytes(
         assert count > 80
 
 
+def test_paths_stay_small_on_long_runs(make_sequence, tmp_path):
+    long = straight(0, 20_000)
+    write_result(
+        tmp_path / "r.mcap", make_sequence(), {"isam2": (long, long, NO_LANDMARKS)}
+    )
+    with (tmp_path / "r.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        lengths = [
+            len(path.poses)
+            for _, _, _, path in reader.iter_decoded_messages(["/isam2/path"])
+        ]
+    assert sum(lengths[:-1]) < 12_000
+    assert 4_000 < lengths[-1] <= 5_001
+
+
 def turning(seed: int, n: int = 60) -> Trajectory:
     """Poses with every number different, at odd instants."""
     rng = np.random.default_rng(seed)
@@ -236,6 +255,26 @@ def test_poses_survive_to_the_bit_in_a_result(make_sequence, tmp_path):
         text = (tmp_path / layout).read_text("utf-8")
         assert "/a/pose_ellipsoid" in text
         assert "/unsure/pose_ellipsoid" not in text
+
+
+@given(st.lists(st.text(max_size=6), max_size=6))
+def test_source_names_are_unique_ros_names(
+    estimators,
+):
+    names = source_names(estimators)
+    assert len(names) == len(set(names)) == len(estimators)
+    assert not {"ground_truth", "tf", "tf_static"} & set(names)
+    assert all(
+        re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) for name in names
+    )
+    close = source_names(["ekf-slam", "ekf_slam", "isam2", "2d", "ground-truth"])
+    assert close == [
+        "ekf_slam",
+        "ekf_slam_2",
+        "isam2",
+        "estimator_2d",
+        "ground_truth_2",
+    ]
 
 
 # --- ellipsoids -----------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import zlib
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -11,19 +12,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log, sonar_image_messages, write_log
-from sonar_graph.logs.mcap import Attachment, recording, write_recording
+from sonar_graph.logs.mcap import Attachment, LogFile, recording, write_recording
 from sonar_graph.logs.mcap.log_file import open_seal
 from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.measurements import Imu
 from sonar_graph.states import Trajectory
 
-from .conftest import decode, scan_all
+from .conftest import chunk_indexes, decode, flip, scan_all
 
 T0_NS = 1_700_000_000_000_000_000
 BLOCKS = (
@@ -66,6 +71,42 @@ def test_reading_what_was_written_is_the_identity(
             )
     assert (found.name, found.calibration) == (sequence.name, sequence.calibration)
     assert found.notes.items() >= sequence.notes.items()
+
+
+def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
+    sequence = make_sequence()
+    write_log(tmp_path / "a.mcap", sequence)
+    messages = decode(tmp_path / "a.mcap")
+    assert set(messages) == {"/imu/data", "/dvl/data", "/depth/pose", "/sonar/landmarks", "/tf_static",
+                             "/ground_truth/odometry", "/ground_truth/landmarks", "/heading",
+                             "/fixes/pose"}  # fmt: skip
+    imu = messages["/imu/data"]
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in imu]
+    assert stamps == sequence.imu.stamps_ns.tolist()
+    rates = [
+        [m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in imu
+    ]
+    assert rates == sequence.imu.angular_velocity.tolist()
+    assert [m.linear_acceleration_covariance[0] for m in imu] == [
+        -1.0 if i % 4 == 0 else 0.0 for i in range(20)
+    ]
+    assert [m.velocity_mode for m in messages["/dvl/data"]] == [1] * 20
+    assert [
+        m.pose.pose.position.z for m in messages["/depth/pose"]
+    ] == sequence.depth.z_m.tolist()
+    assert [
+        m.yaw_rad for m in messages["/heading"]
+    ] == sequence.heading.yaw_rad.tolist()
+    assert [
+        m.pose.pose.position.y for m in messages["/fixes/pose"]
+    ] == sequence.positions.position_m[:, 1].tolist()
+    ranges = [r for m in messages["/sonar/landmarks"] for r in m.range_m]
+    assert ranges == sequence.detections.range_m.tolist()
+    assert list(messages["/ground_truth/landmarks"][0].ids) == [3, 7]
+    (tree,) = messages["/tf_static"]
+    frames = {t.child_frame_id for t in tree.transforms}
+    assert frames == {"imu", "dvl", "depth", "sonar", "positions"}
+    assert tree.transforms[0].transform.translation.y == 0.2
 
 
 def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
@@ -135,6 +176,35 @@ def test_another_library_sees_what_the_message_defines(tmp_path):
     np.testing.assert_allclose([left.z, right.z], np.cos(np.radians([14, 15])))
 
 
+def test_messages_made_one_by_one_lie_in_the_order_of_time(make_sequence, tmp_path):
+    sequence = make_sequence()
+    blocks = [
+        replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1])
+        for row in (4, 12)
+    ]
+    write_log(tmp_path / "a.mcap", sequence)
+    write_log(
+        tmp_path / "b.mcap",
+        sequence,
+        (sonar_image_messages("/sonar/image", block) for block in blocks),
+    )
+    times: list[list[int]] = []
+    for name in ("a.mcap", "b.mcap"):
+        with (tmp_path / name).open("rb") as stream:
+            times.append(
+                [
+                    r.log_time
+                    for r in StreamReader(stream).records
+                    if isinstance(r, Message)
+                ]
+            )
+    assert len(times[0]) > 80
+    assert times[0] == sorted(times[0])
+    assert times[1] == sorted(
+        [*times[0], *(int(block.stamps_ns[0]) for block in blocks)]
+    )
+
+
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
@@ -183,6 +253,44 @@ def test_a_recording_has_the_records_of_rosbag2(
         "application/json",
         b'{"a": 1}',
     )
+
+
+def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> None:
+    with LogFile(long_log) as file:
+        assert (file.summary is not None, file.fault) == (True, None)
+        stated = int.from_bytes(file.read(file.data_end_at + 9, 4), "little")
+        assert stated == zlib.crc32(file.read(0, file.data_end_at)) != 0
+    chunk = chunk_indexes(long_log)[1]
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(long_log.read_bytes())
+    flip(damaged, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
+    with (
+        damaged.open("rb") as stream,
+        pytest.raises((McapError, ValueError, RuntimeError)),
+    ):
+        list(make_reader(stream, validate_crcs=True).iter_messages())
+
+
+def test_latched_topics_offer_transient_local_qos(
+    long_log: Path,
+) -> None:
+    """Versions that would expect words read numbers when the record ``rosbag2`` has no metadata of theirs."""
+    with AnyReader([long_log]) as reader:
+        offered = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
+        assert sum(1 for _ in reader.messages()) == 20_001
+    (start,) = offered["/start"]
+    names = (start.durability.name, start.reliability.name, start.history.name)
+    assert names == ("TRANSIENT_LOCAL", "RELIABLE", "KEEP_LAST")
+    assert offered["/pose"] == []
+    with long_log.open("rb") as stream:
+        reader = make_reader(stream)
+        (channel,) = [
+            c for c in reader.get_summary().channels.values() if c.topic == "/start"
+        ]  # type: ignore[union-attr]
+        assert "durability: 1," in channel.metadata["offered_qos_profiles"]
+        assert {m.name: m.metadata for m in reader.iter_metadata()}["rosbag2"] == {
+            "serialized_metadata": ""
+        }
 
 
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:

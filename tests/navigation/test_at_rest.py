@@ -19,12 +19,14 @@ from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, noise_densities
 from sonar_graph.navigation.alignment.allan import allan_deviation
 from sonar_graph.navigation.alignment.at_rest import (
+    angles_by_up,
     earth_up_and_level,
+    roll_and_pitch,
 )
 from sonar_graph.testing import check_consistent
 
 from . import ways
-from .rows import NS, at, dvl
+from .rows import NS, at, derivative, dvl
 from .ways import acceleration_at, attitude, rate_at, velocity_at
 
 G = 9.80665
@@ -124,6 +126,11 @@ def test_what_is_no_rest_is_refused(spoil, message):
     assert message in refusal(spoil(imu))
 
 
+def noisy(seed: int, rest_s: float = 20.0, times: float = 1.0) -> Imu:
+    """Noise of so many times the density that is known."""
+    return rest(np.random.default_rng(seed), noise=times, rest_s=rest_s)
+
+
 def refusal(imu: Imu, known: Calibration = KNOWN, log: Dvl | None = None) -> str:
     try:
         align_at_rest(imu, known, log)
@@ -171,6 +178,33 @@ def test_up_is_found_in_a_moving_vehicle():
     assert np.arccos(naive @ truth) > np.radians(1)
 
 
+def test_stated_sigma_is_that_of_many_noisy_intervals():
+    """Two-sided, about both horizontal axes, with noise in force, bias, both velocities, and gyros."""
+    motion, v_i, v_j, end = accelerated()
+    level = end.inv().apply(np.eye(3)[:2])
+    rng = np.random.default_rng(1)
+    velocity_sigma = 0.004
+    squares = []
+    by_gyros = np.hypot(
+        IMU.gyro_noise_density * np.sqrt(T / 3), IMU.gyro_bias_sigma * T / 2
+    )
+    for _ in range(1500):
+        force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(
+            T
+        ) * rng.standard_normal(3)
+        noisy = replace(
+            motion,
+            mean_specific_force=force + IMU.accel_bias_sigma * rng.standard_normal(3),
+        )
+        scatter = velocity_sigma * rng.standard_normal((2, 3))
+        up, sigma = gravity_direction(
+            noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, MOVING
+        )
+        up = up + np.cross(by_gyros * rng.standard_normal(3), up)
+        squares.append(np.sum((level @ up / sigma) ** 2))
+    check_consistent(squares, 2, confidence=0.999)
+
+
 def test_without_forces_there_is_no_direction():
     unfelt = replace(accelerated()[0], mean_specific_force=np.full(3, np.nan))
     assert gravity_direction(unfelt, np.zeros(3), np.zeros(3), 0.01, MOVING) is None
@@ -193,6 +227,26 @@ def test_the_earth_turns_north_at_the_equator_and_up_at_the_north_pole(
     assert 360 / np.linalg.norm(found) == pytest.approx(23.9345, abs=1e-4)
     assert earth_rate_in_world(Calibration()) is None
     assert earth_up_and_level(Calibration()) == (0.0, 0.0)
+
+
+ATTITUDES = [(0.3, -0.4), (-2.8, 1.2), (0.0, 0.0), (1.5, -1.5)]
+
+
+def up_of(roll: float, pitch: float, yaw: float = 0.7) -> np.ndarray:
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).inv().apply([0, 0, 1.0])
+
+
+@pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
+def test_the_derivative_is_that_of_turning_up_a_little(roll, pitch):
+    """Along the sphere; a change of length changes neither angle."""
+    up = up_of(roll, pitch)
+
+    def angles(phi: np.ndarray) -> tuple[float, float]:
+        return roll_and_pitch(Rotation.from_rotvec(phi).apply(up))
+
+    by_turn = derivative(lambda phi: Rotation.from_rotvec(phi).apply(up), 3)
+    assert angles_by_up(up) @ by_turn == pytest.approx(derivative(angles, 3), abs=1e-6)
+    assert angles_by_up(up) @ up == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
 RATE_HZ = 50.0

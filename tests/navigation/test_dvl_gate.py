@@ -16,6 +16,7 @@ from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
     GateResult,
     gate_velocities,
+    needed,
 )
 from sonar_graph.navigation.samples import VelocityRows
 from sonar_graph.states import Refusal
@@ -110,6 +111,20 @@ def test_wrong_ones_of_the_first_rows_are_refused_and_no_others(wrong, hz):
     assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0])
+def test_a_vehicle_that_moves_from_the_start_keeps_its_first_row(speed):
+    """Once enough rows agree, and never later than the tenth; its own rows are kept to the bit."""
+    rows = start({}, speed)
+    enough = needed(rows.velocity[0])
+    assert enough <= min(10, 2 + speed**2 / 4)
+    assert not len(told(rows.rows(slice(0, enough - 1))).rows()[3])
+    columns = told(rows.rows(slice(0, enough))).rows()[3:6]
+    for column, own in zip(
+        columns, (rows.stamps_ns, rows.velocity, rows.velocity_cov), strict=True
+    ):
+        assert np.array_equal(column, own[:enough])
+
+
 def test_the_start_stays_a_node_with_the_first_accepted_velocity():
     """Less surely known: by the walk and what the vehicle may have turned since."""
     rows = start({0: WRONG, 1: WRONG})
@@ -140,6 +155,32 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
         used = np.isin(ns, told(rows, calls).rows()[3])
         assert not used[wrong].any()
         assert used[~wrong].sum() >= np.count_nonzero(~wrong) - 2
+
+
+def after_gap(
+    gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3
+) -> tuple[Dvl, int]:
+    """A log with a gap after 10 s, and its first row after that."""
+    ns = stamps(HZ, 10.0 + gap_s + 5.0)
+    ns = ns[(ns <= at(10.0)) | (ns > at(10.0 + gap_s))]
+    first = int(np.argmax(np.diff(ns))) + 1
+    velocity = np.tile([speed, 0.0, 0.0], (len(ns), 1))
+    for row, value in wrong.items():
+        velocity[first + row] = value
+    return dvl(ns, velocity, 1e-4 * np.eye(3)), first
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{0: WRONG}, {1: WRONG}, {0: WRONG, 1: WRONG, 2: WRONG}, {0: [2.0, 1.0, 0.0]}],
+)
+@pytest.mark.parametrize("gap_s", [10.0, 60.0])
+def test_wrong_rows_after_a_long_gap_are_refused_and_no_others(gap_s, wrong):
+    rows, first = after_gap(gap_s, wrong)
+    for calls in (1, len(rows)):
+        odometry = told(rows, calls)
+        assert refused(odometry, rows) == [first + row for row in wrong]
+        assert np.abs(odometry.rows()[4]).max() == pytest.approx(0.3)
 
 
 DEPTHS = Calibration(

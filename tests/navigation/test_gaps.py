@@ -1,5 +1,6 @@
 """Gaps of the Doppler log and holes of the IMU: covariances, limits, and what estimators make of them."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -342,6 +343,17 @@ def test_the_variances_are_those_of_drawn_rates(length_s):
     assert open_variance(sigma, time_s, length_s) == pytest.approx(opened, rel=0.06)
 
 
+@pytest.mark.parametrize(
+    ("variance", "power", "share"), [(closed_variance, 5, 30), (open_variance, 4, 4)]
+)
+def test_short_holes_follow_their_series_without_a_step(variance, power, share):
+    lengths = np.geomspace(0.003, 0.3, 60)
+    found = np.array([variance(1.0, 1.0, a) for a in lengths])
+    assert found[0] == pytest.approx(lengths[0] ** power / share, rel=3e-3)
+    slopes = np.diff(np.log(found)) / np.diff(np.log(lengths))
+    assert np.all(np.abs(slopes - power) < 0.2)
+
+
 def test_a_hole_is_longer_than_five_intervals_and_a_twentieth_second():
     for interval_ms, longest_ms, hole_ms in ((10, 50, 51), (100, 499, 501)):
         ns = T0_NS + interval_ms * MS * np.arange(12)
@@ -374,3 +386,28 @@ def test_the_turn_over_a_hole_is_as_unsure_as_the_vehicle_is_lively(
     ]
     assert extra == pytest.approx(expected, rel=0.06)
     assert expected[2] > 100 * model.gyro_noise_density**2 * 4.0
+
+
+@pytest.mark.parametrize("until_s", [4.0, 3.46], ids=["closed", "open"])
+@pytest.mark.parametrize("is_modelled", [True, False])
+def test_a_coarse_gyros_rows_beside_a_hole_err_for_all_of_it(until_s, is_modelled):
+    """Against rates drawn for a vehicle at rest, a hole of half a second."""
+    known = with_hole(3.0, 3.5).between(0, at(until_s))
+    rng = np.random.default_rng(3)
+    coarse = ImuCalibration(
+        gyro_noise_density=1e-3, turn_sigma_rad_s=(1e-6 * is_modelled,) * 3
+    )
+    turned = []
+    for _ in range(150):
+        rates = rng.normal(0.0, 1e-3 / np.sqrt(0.01), (len(known), 3))
+        found = moved(
+            replace(known, angular_velocity=rates),
+            2.0,
+            until_s,
+            Calibration(imu=coarse),
+        )
+        turned.append(
+            found.i_T_j.rotation().rpy() / np.sqrt(np.diag(found.covariance)[:3])
+        )
+    nees = np.mean(np.square(turned))
+    assert nees == pytest.approx(1.0, abs=0.2) if is_modelled else nees > 4.0

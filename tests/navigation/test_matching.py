@@ -18,6 +18,7 @@ from sonar_graph.navigation.alignment import (
     InertialPath,
     match_dvl_to_imu,
     match_reference_to_imu,
+    stretches_of,
 )
 from sonar_graph.navigation.alignment.dvl_imu import velocity_changes
 from sonar_graph.navigation.alignment.reference_offset import ReferenceMatch
@@ -92,11 +93,42 @@ def without_rows(imu: Imu, is_lost: Callable[[np.ndarray], np.ndarray]) -> Imu:
     return imu.rows(~is_lost((imu.stamps_ns - imu.stamps_ns[0]) * 1e-9))
 
 
+def test_a_hole_ends_a_stretch_of_a_slow_doppler_log_too():
+    """Of one row in two seconds, whose gaps are no longer than what it always has."""
+    seconds = np.arange(0.0, 200.0, 2.0)
+    parts = (seconds > 101).astype(np.int64)
+    assert not any(
+        run.start <= 50 < run.stop - 1 for run in stretches_of(seconds, parts)
+    )
+    assert any(
+        run.start <= 50 < run.stop - 1
+        for run in stretches_of(seconds, np.zeros_like(parts))
+    )
+
+
 def with_mounting(run: Sequence, **mounting: tuple[float, float, float]) -> Calibration:
     """The run's calibration, with another mounting of the IMU."""
     moved = run.calibration.imu.mounting.model_copy(update=mounting)
     imu = run.calibration.imu.model_copy(update={"mounting": moved})
     return run.calibration.model_copy(update={"imu": imu})
+
+
+@pytest.mark.slow
+def test_the_lever_arm_is_found_whatever_the_calibration_says():
+    """The simulator's: (-0.2, 0, -0.15) m. From calibrations metres apart comes one arm."""
+    run = spoilt()
+    elsewhere = replace(
+        run, calibration=with_mounting(run, translation_m=(1.4, -1.2, 1.0))
+    )
+    here = matched(run)
+    there = matched(elsewhere)
+    for one, other, truth in zip(
+        here.lever, there.lever, (-0.2, 0.0, -0.15), strict=True
+    ):
+        assert_found(one, truth, 0.4)
+        assert_found(other, truth, 0.4)
+        assert abs(one.value - other.value) < 0.25 * one.sigma
+    assert there.yaw.value == pytest.approx(here.yaw.value, abs=0.25 * here.yaw.sigma)
 
 
 def on_a_plane(arm_m: np.ndarray) -> tuple[Imu, Dvl]:
@@ -122,6 +154,15 @@ def on_a_plane(arm_m: np.ndarray) -> tuple[Imu, Dvl]:
     )
     imu = Imu(imu_ns, rate + 1e-4 * imu_noise[0], force + 1e-2 * imu_noise[1])
     return imu, dvl(dvl_ns, velocity + 0.01 * dvl_noise)
+
+
+def test_turning_about_one_axis_tells_the_arm_across_it_alone():
+    arm = np.array([0.7, -0.4, 0.5])
+    found = match_dvl_to_imu(*on_a_plane(arm), Calibration())
+    for one, truth in zip(found.lever[:2], arm, strict=False):
+        assert_found(one, truth, 0.1)
+    assert not found.lever[2].is_known
+    assert found.lever[2].reason == "too little turning"
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -17,6 +17,7 @@ from sonar_graph.calibration import (
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import Odometry, PreintegratedMotion
+from sonar_graph.navigation.samples import longest_interval_ns
 
 from .rows import NS, T0_NS, at, dvl, imu, stamps, waves
 from .ways import DVL, NOISY, QUIET, Vehicle
@@ -24,6 +25,9 @@ from .ways import DVL, NOISY, QUIET, Vehicle
 SECONDS = 3.0
 ZERO = np.zeros(3)
 BIAS = np.array([0.01, -0.02, 0.03])
+
+
+HELD = Calibration(odometry_interpolation="hold-past")
 
 
 def recorded(
@@ -135,6 +139,31 @@ def test_a_node_is_reached_only_when_an_imu_row_covers_it():
     assert (odometry.epochs(T0_NS + 50, T0_NS + 300) - T0_NS).tolist() == [150]
 
 
+@pytest.mark.parametrize("calibration", [Calibration(), HELD], ids=["linear", "held"])
+def test_forgetting_changes_nothing_afterwards(calibration):
+    imu_rows, dvl_rows = recorded(seconds=12.0)
+    full, forgetful = (odometry_of(imu_rows, dvl_rows, calibration) for _ in range(2))
+    epochs = full.epochs(0, T0_NS + 20 * NS).tolist()
+    for k, epoch_ns in enumerate(epochs[1:-1], 1):
+        forgetful.forget_before(epoch_ns)
+        for until_ns in (epochs[k + 1], epoch_ns + 10_000_000):
+            assert same(
+                forgetful.motion(epoch_ns, until_ns, BIAS),
+                full.motion(epoch_ns, until_ns, BIAS),
+            )
+        for mine, theirs in zip(
+            forgetful.velocity_at_imu(epoch_ns),
+            full.velocity_at_imu(epoch_ns),
+            strict=True,
+        ):
+            assert np.array_equal(mine, theirs)
+        assert np.array_equal(
+            forgetful.epochs(epoch_ns, T0_NS + 20 * NS), epochs[k + 1 :]
+        )
+    with pytest.raises(MeasurementError, match="lies before the rows"):
+        forgetful.motion(epochs[0], epochs[-1], BIAS)
+
+
 @given(
     st.lists(st.floats(0.05, 0.3), min_size=3, max_size=30), st.integers(0, 2**32 - 1)
 )
@@ -198,6 +227,42 @@ def test_what_bounds_no_motion_is_named():
         assert odometry.motion(
             at(start_s), at(end_s), ZERO
         ).duration_s == pytest.approx(end_s - start_s)
+
+
+def test_a_gap_is_longer_than_the_calibration_says():
+    """Between nodes that follow each other; held samples leave none."""
+    calibration = Calibration(dvl=DvlCalibration(gap_s=0.5))
+    assert longest_interval_ns(calibration) == NS // 2
+    rows = (
+        imu(stamps(10, 5.0), 0.0),
+        dvl(T0_NS + np.array([0, 500, 1001, 1501, 4000]) * 1_000_000, 0.0),
+    )
+    odometry, held = (
+        odometry_of(*rows, c)
+        for c in (calibration, HELD.model_copy(update={"dvl": calibration.dvl}))
+    )
+    assert not odometry.is_gap(at(0.0), at(0.5))
+    assert odometry.is_gap(at(0.0), at(0.5) + 1)
+    assert not held.is_gap(at(0.0), at(1e6))
+    ends_s = [
+        (0.0, 0.5),
+        (0.5, 1.001),
+        (1.001, 1.501),
+        (1.501, 4.0),
+        (0.0, 1.501),
+        (1.501, 2.0),
+        (1.501, 2.1),
+    ]
+    starts, ends = (np.array([at(s[k]) for s in ends_s]) for k in (0, 1))
+    is_gap = [False, True, False, True, True, False, True]
+    assert (
+        np.isnan(odometry.motions(starts, ends, ends, ZERO).C[:, 0, 0]).tolist()
+        == is_gap
+    )
+    for column in odometry.motions(starts, ends, ends, ZERO):
+        assert [np.isnan(value).all() for value in column] == is_gap
+        assert [np.isnan(value).any() for value in column] == is_gap
+    assert np.isfinite(held.motions(starts, ends, ends, ZERO).dp).all()
 
 
 def swaying(interpolation: str = "linear", earth: np.ndarray | None = None) -> Odometry:

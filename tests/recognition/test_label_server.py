@@ -4,6 +4,12 @@ Chromium comes from the system, as in tests/report/test_page_in_browser.py.
 """
 
 import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -21,6 +27,10 @@ from sonar_graph.recognition import (
 )
 from sonar_graph.recognition.label_server import ShownFrame
 
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+    None,
+)
 IDS = [1, 2, 3, 4]
 
 
@@ -154,3 +164,106 @@ def test_what_cannot_be_saved_is_said_and_not_kept(server, monkeypatch):
     )
     assert answer["fault"] == "not saved: no space left"
     assert answer["total"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")
+def test_landmarks_are_clicked_in_a_browser_and_kept_over_ctrl_c(lane_log, tmp_path):
+    sync_api = pytest.importorskip(
+        "playwright.sync_api",
+        reason="playwright is not installed: pip install playwright",
+    )
+    out = tmp_path / "labels.json"
+    for before in (0, 2):
+        words = [
+            sys.executable,
+            "-m",
+            "sonar_graph",
+            "label",
+            str(lane_log),
+            "-o",
+            str(out),
+            "--no-browser",
+        ]
+        command = subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            line = command.stdout.readline()
+            assert f"{before} labels so far" in line
+            with sync_api.sync_playwright() as playwright:
+                browser = playwright.chromium.launch(
+                    executable_path=BROWSER, args=["--no-sandbox"]
+                )
+                click_two(
+                    browser, re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)[0], before
+                )
+                browser.close()
+            command.send_signal(signal.SIGINT)
+            said, complaints = command.communicate(timeout=20)
+        finally:
+            command.kill()
+        assert (command.returncode, complaints) == (0, "")
+        assert f"Labels: {out} ({before + 2})" in said
+    ids = [label.id for label in read_labels(out, lane_log).labels]
+    assert ids == [None, 3, None, 3]
+
+
+def click_two(browser, address: str, before: int) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(address)
+    status = page.locator("#said")
+    until(lambda: page.evaluate("document.getElementById('picture').naturalWidth") > 0)
+    if before:
+        until(lambda: status.text_content() == f"{before} labels so far")
+    frame = 1 + before // 2
+    for _ in range(frame):
+        page.keyboard.press("ArrowRight")
+    page.keyboard.press("PageDown")
+    page.keyboard.press("PageUp")
+    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 1} of "))
+    page.keyboard.press("3")
+    assert page.locator("input[value='3']").is_checked()
+    box = page.locator("#picture").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.click(*middle)
+    until(lambda: status.text_content() == f"saved: {before + 1} labels")
+    page.keyboard.press("0")
+    page.mouse.click(middle[0], middle[1] + 90)
+    page.mouse.click(middle[0], middle[1] - 90)
+    until(lambda: status.text_content() == f"saved: {before + 3} labels")
+    page.keyboard.press("Backspace")
+    until(lambda: status.text_content() == f"saved: {before + 2} labels")
+    assert page.locator("#marks circle").count() == 2
+    mark = page.locator("#marks circle").nth(0).bounding_box()
+    assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
+    assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
+    held: list = []
+    # a picture that is long in coming
+    page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))
+    page.keyboard.press("ArrowRight")
+    until(lambda: page.locator("#frame").input_value() == f"{frame + 1}")
+    page.keyboard.press("3")
+    page.mouse.click(*middle)  # of the picture that is shown, whose label it replaces
+    page.wait_for_timeout(200)
+    assert page.locator("#where").text_content().startswith(f"{frame + 1} of ")
+    assert page.locator("#marks text").all_text_contents() == ["none", "3"]
+    held[0].continue_()
+    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 2} of "))
+    assert page.locator("#marks circle").count() == 0
+    for width in (390, 1280):
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert said == []
+
+
+def until(holds) -> None:
+    """Wait until something holds; the page's policy allows no strings as code, by which playwright would wait."""
+    for _ in range(500):
+        if holds():
+            return
+        time.sleep(0.02)
+    raise AssertionError("it never held")

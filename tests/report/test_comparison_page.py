@@ -19,7 +19,7 @@ from sonar_graph.evaluation import (
     score_table,
 )
 from sonar_graph.recognition import with_detections
-from sonar_graph.report import sentences, write_report
+from sonar_graph.report import sentences, write_page, write_report
 from sonar_graph.report.comparison_page import recognition_content, render_report
 from sonar_graph.table import Table
 from tests.synthetic import (
@@ -64,6 +64,7 @@ def test_every_run_score_protocol_and_file_appears(comparison, page):
     assert "runs/dead-reckoning/landmarks.csv" not in addresses
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_unknown_scores_and_doubts_are_shown(
     comparison,
 ):
@@ -145,6 +146,7 @@ def test_page_is_whole_whatever_is_missing(comparison, change):
     assert re.findall(r"\b(nan|NaN|inf|None)\b", page.text) == []
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_without_landmarks_no_figure_of_them_is_announced(comparison):
     alone = only(comparison, "dead-reckoning")
     blind = replace(alone, sequence=replace(alone.sequence, detections=None))
@@ -178,6 +180,13 @@ def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
     assert "show-raw" not in page.text
 
 
+@pytest.mark.slow
+def test_a_long_mission_still_makes_a_small_page(tmp_path):
+    write_page(basin_comparison(4078), tmp_path)
+    assert (tmp_path / "report.html").stat().st_size < 3_000_000
+
+
+@pytest.mark.usefixtures("unrendered")
 def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
     same = replace(
         comparison,
@@ -250,6 +259,7 @@ def test_without_truth_there_is_no_aligned_view():
         blind.plot_errors()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_filter_as_published_is_named_so_with_its_fair_neighbour(comparison):
     """Beside its name in the table, and in a sentence with what it lacks."""
     plain = {"gate_probability": 1.0, "kernel_width": 0.0}
@@ -295,6 +305,7 @@ def test_the_section_shows_pictures_and_counts(recognised, lane_recognition):
     )
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
     warnings = [(recognised.sequence.start_ns + 1_250_000_000, "<b> & so on")]
     warned = replace(

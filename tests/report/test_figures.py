@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation import Comparison, map_instants
+from sonar_graph.evaluation import Comparison, map_instants, published_maps
 from sonar_graph.evaluation.results import MapSoFar
 from sonar_graph.report import figures
 from sonar_graph.report.figure_style import (
@@ -26,7 +26,12 @@ from sonar_graph.report.figure_style import (
 )
 from sonar_graph.report.figures import growth_figure, illustrations, map_figure
 from sonar_graph.report.figures.error_figures import errors_cut_off
-from sonar_graph.report.figures.maps import enlargement
+from sonar_graph.report.figures.maps import (
+    ENLARGED,
+    LARGEST_ELLIPSE,
+    enlargement,
+    map_view,
+)
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
@@ -245,9 +250,54 @@ def test_ellipses_are_as_large_as_the_caption_says():
     )
 
 
+@pytest.mark.parametrize("number", range(len(ENLARGED)))
+@pytest.mark.parametrize("is_just_too_large", [False, True])
+def test_ellipses_are_as_large_as_the_figure_has_room_for(number, is_just_too_large):
+    """By the widest ellipse of the maps that are drawn; heights and maps of other instants do not count."""
+    comparison = grown()
+    room_m = LARGEST_ELLIPSE * np.ptp(map_view(comparison), axis=0).max()
+    largest_m = room_m / ENLARGED[number] / np.sqrt(chi2.ppf(0.95, 2))
+    sigma_m = largest_m * (1.001 if is_just_too_large else 0.999)
+    runs = []
+    for run in comparison.runs:
+        maps = list(run.maps)
+        if maps:
+            covariances = np.tile((sigma_m / 3) ** 2 * np.eye(3), (4, 1, 1))
+            covariances[1] = np.diag([sigma_m**2, 0.0, 1e6])
+            maps = [
+                replace(
+                    known,
+                    landmarks=replace(
+                        known.landmarks, covariances=covariances[: len(known.landmarks)]
+                    ),
+                )
+                for known in maps
+            ]
+            between = replace(maps[-1].landmarks, covariances=1e4 * covariances)
+            maps.append(MapSoFar(maps[0].stamp_ns + 1, between))
+        runs.append(replace(run, maps=maps))
+    expected = ENLARGED[max(number - is_just_too_large, 0)]
+    assert enlargement(replace(comparison, runs=runs)) == expected
+
+
 def test_without_maps_on_the_way_the_page_says_so():
     comparison = basin_comparison(60)
     assert growth_figure(comparison) is None
     assert illustrations(comparison)["growth"].instead
     figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
     assert len(figure.axes) == 3
+
+
+@pytest.mark.slow
+def test_only_the_repeated_experiment_names_the_papers_figures():
+    other = grown(60)
+    same = replace(
+        other, sequence=replace(other.sequence, true_landmarks=published_maps()[1])
+    )
+    for name, counterpart in (("growth", "Fig. 4"), ("yaw", "Fig. 5")):
+        assert counterpart in illustrations(same)[name].caption
+        assert "paper" not in illustrations(other)[name].caption
+    assert (
+        "same fractions of this run as its 833.1, 1369.4 and 2039.0 s"
+        in illustrations(same)["growth"].caption
+    )

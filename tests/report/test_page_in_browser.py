@@ -165,6 +165,55 @@ def test_one_switch_aligns_figures_tables_and_headline(browser, comparison_file,
         assert said == []
 
 
+def test_folded_chapters_of_a_comparison_stand_on_paper(browser, comparison_file):
+    folded = (
+        "[...document.querySelectorAll('details.chapter:not([open]) > :not(summary)')]"
+    )
+    with opened(browser, comparison_file, DESKTOP) as (page, _):
+        assert page.evaluate(f"{folded}.length") > 5
+        assert not page.evaluate(f"{folded}.some(one => one.checkVisibility())")
+        page.emulate_media(media="print")
+        assert page.evaluate(f"{folded}.every(one => one.checkVisibility())")
+
+
+def test_paper_has_folded_tables_and_light_colours(
+    browser, page_file, page_of_many_logs, tmp_path
+):
+    shown = "document.querySelector('#table-consistency').checkVisibility()"
+    with opened(browser, page_of_many_logs, DESKTOP) as (page, _):
+        for event, is_shown in (
+            ("click", False),
+            ("beforeprint", True),
+            ("afterprint", False),
+        ):
+            page.evaluate(f"dispatchEvent(new Event('{event}'))")
+            assert page.evaluate(shown) is is_shown
+    with opened(browser, page_file, DESKTOP, "dark") as (page, _):
+        page.emulate_media(media="print")
+        assert (
+            sum(_rgb(page.evaluate("getComputedStyle(document.body).backgroundColor")))
+            == 3 * 255
+        )
+        page.pdf(path=str(tmp_path / "page.pdf"), format="A4")
+    assert (tmp_path / "page.pdf").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_figures_are_drawn_in_the_colours_of_the_page(browser, page_file, scheme):
+    with opened(browser, page_file, DESKTOP, scheme) as (page, _):
+        boxes = page.evaluate(
+            "[...document.querySelectorAll('figure svg')].map(svg => "
+            "({width: svg.getBoundingClientRect().width, marks: svg.querySelectorAll('path, use').length}))"
+        )
+        ink, paper = page.evaluate(
+            "[getComputedStyle(document.querySelector('figure svg text')).fill, "
+            "getComputedStyle(document.body).backgroundColor]"
+        )
+    assert len(boxes) >= 3
+    assert all(box["width"] > 300 and box["marks"] > 10 for box in boxes)
+    assert (sum(_rgb(ink)) > sum(_rgb(paper))) == (scheme == "dark")
+
+
 def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
     rows = "document.querySelectorAll('#table-difference-ate-se2-m tbody tr')"
     values = (

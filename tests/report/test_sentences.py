@@ -300,6 +300,7 @@ def test_a_map_is_wrong_beyond_its_quantile():
     )
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
     comparison = with_map(IDS, [0.0, 0.05, 5.0, 0.01])
     line = (
@@ -369,6 +370,7 @@ def test_a_log_without_any_identity_is_told_with_what_to_do(outcomes, count):
     assert (line in printed(blind, 200)) == bool(count)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.02, 3.0, 0.01])
     sentence = "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2 and 4."
@@ -411,6 +413,7 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     )
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_terminal_and_page_list_refused_and_withheld_rows():
     start_ns = basin_comparison(60).sequence.start_ns
     calm = basin_comparison(60)

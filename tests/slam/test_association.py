@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.models import ACCEPTED, identify
@@ -15,9 +15,12 @@ from sonar_graph.slam.landmarks.mixture import (
     IdentityPosterior,
     RecogniserErrors,
 )
+from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide
 from sonar_graph.slam.landmarks.unknown import (
     UNPAIRED,
     Innovations,
+    Pairing,
+    drop_unlikely,
     pair_jointly,
 )
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
@@ -94,6 +97,24 @@ def test_weights_are_a_distribution_with_none_impossible(
     )
     assert weights.sum() == pytest.approx(1.0)
     assert weights.min() >= min(0.5 * q / count, 0.5 * q) * (1 - 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("belief", "decided"),
+    [
+        ([0.75, 0.0], 4),  # binary fractions: exactly at the threshold
+        ([0.0, 0.75], 7),
+        ([0.5, 0.25], UNDECIDED),
+        ([0.125, 0.125], NO_LANDMARK),
+        ([0.125, 0.1875], UNDECIDED),
+        ([np.nextafter(0.75, 0.0), 0.0], UNDECIDED),
+        ([0.0, 0.0], NO_LANDMARK),
+    ],
+)
+def test_what_reaches_the_least_probability_is_decided(
+    belief: list[float], decided: int
+) -> None:
+    assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
 
 
 PROBABILITY = 0.95
@@ -188,3 +209,43 @@ def test_the_pairing_is_that_of_trying_all(seed: int, m: int, n: int, spread: fl
     assert found.size == size
     assert found.distance == pytest.approx(squared, rel=1e-6, abs=1e-9)
     assert found.landmarks == landmarks
+
+
+SPACING = 1.0
+
+
+SHIFT = 0.8
+
+
+VEHICLE_SIGMA = 1.0
+
+
+SIGMA = 0.1
+
+
+def shifted() -> Innovations:
+    """Two landmarks a metre apart, both seen, by a vehicle that is off by nearly that metre."""
+    expected = np.array([[0.0, 0.0], [SPACING, 0.0]])
+    z = expected + np.array([SHIFT, 0.0])
+    shared = np.tile(np.eye(2), (2, 1))
+    cov = VEHICLE_SIGMA**2 * shared @ shared.T + 1e-4 * np.eye(4)
+    return Innovations(
+        z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (2, 1, 1))
+    )
+
+
+def test_two_that_share_a_wide_error_support_each_other():
+    """One alone has no weight beside a rival of 0.2 a unit; two at the right distance from each other do.
+
+    Each given the other is denser than a rival of 3 a unit; where both are together is not.
+    """
+    rival = np.log(np.full(2, 0.2))
+    case = shifted()
+    both = Pairing((0, 1), 0.0)
+    assert drop_unlikely(case, both, rival).landmarks == (0, 1)
+    assert drop_unlikely(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
+    e, C = case.of(both.landmarks)
+    together = multivariate_normal.logpdf(e, cov=C)
+    given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])
+    assert given_the_other > np.log(3.0) > together / 2
+    assert drop_unlikely(case, both, np.log(np.full(2, 3.0))).size == 0

@@ -108,6 +108,13 @@ def test_behind_begins_at_a_right_angle_to_what_was_measured():
         assert np.any(camera.linearize(values).jacobian()[0]) != is_behind
 
 
+def test_a_landmark_is_misplaced_if_behind_half_of_its_sightings():
+    values = values_of(X0=POSE, L1=world_point(*Z))
+    opposite = np.array([2.0, Z[1] + np.pi])
+    assert misplaced(values, seen(Z, opposite)) == [L(1)]
+    assert misplaced(values, seen(Z, opposite, Z)) == []
+
+
 @pytest.mark.parametrize("wrong", [4, 6])
 def test_a_few_wrong_first_sightings_do_not_hold_a_landmark(
     wrong: int,

@@ -4,12 +4,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L
 
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
-from sonar_graph.states import Estimate
+from sonar_graph.states import Estimate, Outcome
 
+from .late_identities import SURE, on_the_rail
 from .made import ran
 from .rail import STEP_S, rail
 
@@ -70,6 +72,45 @@ def test_poses_that_left_are_least_squares_as_far_as_the_lag_reached():
     assert estimator.landmarks().positions[:, 0] == pytest.approx(
         [all_mean["l4"], all_mean["l7"]], abs=1e-7
     )
+
+
+def seven_after(belief: list[float], frames: int) -> Sequence:
+    """Landmark 7 is known after some frames in which something else is believed of it; 4 from the start."""
+    return on_the_rail([belief] * frames + [SURE[7]], SURE[4])
+
+
+@pytest.mark.parametrize(("frames", "is_corrected"), [(3, True), (12, False)])
+def test_a_wrong_identity_is_taken_back_as_far_as_the_window_reaches(
+    frames, is_corrected
+):
+    """Landmark 7 is taken for 6 at first. Corrected within the lag the run is the right one; else 6 stays."""
+    late, _ = run(
+        seven_after([0.0, 0.0, 1.0, 0.0], frames),
+        "bounded",
+        **EXACT,
+        smoother__lag_s=4.0,
+    )
+    right, _ = run(seven_after([], 0), "bounded", **EXACT, smoother__lag_s=4.0)
+    maps = [
+        dict(
+            zip(e.landmarks().ids.tolist(), e.landmarks().positions[:, 0], strict=True)
+        )
+        for e in (late, right)
+    ]
+    assert (maps[0].keys() == maps[1].keys()) == is_corrected
+    assert set(maps[0]) - set(maps[1]) == (set() if is_corrected else {6})
+    assert late.values.exists(L(6)) is not is_corrected
+    if is_corrected:
+        assert maps[0] == pytest.approx(maps[1], abs=1e-6)
+        assert late.trajectory().positions == pytest.approx(
+            right.trajectory().positions, abs=1e-6
+        )
+    outcomes = late.detections().outcomes
+    assert outcomes.count(Outcome.MOVED) == (
+        frames if is_corrected else outcomes.count(Outcome.MOVED)
+    )
+    assert outcomes.count(Outcome.MOVED) <= frames
+    assert all(np.isfinite(late.trajectory().covariances).ravel())
 
 
 def test_what_need_not_be_remembered_is_forgotten_and_nothing_else_changes():

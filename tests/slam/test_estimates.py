@@ -80,6 +80,25 @@ def dense(estimator: Isam2, values: gtsam.Values, keys: list[int]) -> Floats:
     return dense_covariance(factors_of(estimator.graph), values, keys)
 
 
+KEYFRAMES = [4, 0, 2]
+
+
+LANDMARKS = [5, 2]
+
+
+KEYS = [L(2), L(5), X(0), X(2), X(4)]
+
+
+def test_over_the_history_it_is_the_inverse_of_the_whole_information():
+    estimator = ran(5.0)
+    values = gtsams_solution(estimator.graph, estimator.values)
+    found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS, over="history")
+    assert off_sigmas(found.matrix, dense(estimator, values, KEYS)) < 1e-4
+    of_one = estimator.joint_covariance(landmarks=np.array([5])).matrix
+    assert np.array_equal(of_one, estimator.marginal(landmark=5))
+    assert np.array_equal(found.at(L(5), X(2)), found.matrix[3:6, 12:18])
+
+
 def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
     estimator = ran(5.0, "bounded")
     newest = len(estimator.keyframe_stamps()) - 1

@@ -1,6 +1,7 @@
 """Factors: errors in closed form, derivatives by differences, information by directions."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -183,6 +184,56 @@ def test_derivatives_are_those_of_differences(
         )
 
 
+def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
+    """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
+    motion = some_motion(2, 0.05)
+    pose = POSES["random"]
+    bias = 0.01 * np.arange(-5.0, 6.0)
+    perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
+    X_j = pose.compose(motion.i_T_j).compose(
+        gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias))
+    )
+    factor = OdometryWithBias(X(0), X(1), B(0), motion)
+    assert np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=bias)), 0, atol=1e-12
+    )
+    off = X_j.compose(gtsam.Pose3.Expmap(perturbation))
+    assert np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation
+    )
+    assert not np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3
+    )
+
+
+def test_a_heading_bias_turns_about_the_estimated_vertical():
+    """Where the tilt is estimated otherwise than when the motion was set, too: then it never is a tilt for gravity."""
+    motion = some_motion(2, 0.05)
+    pose = POSES["random"]
+    rng = np.random.default_rng(5)
+    up_j = np.array([0.1, -0.2, 0.97])
+    h = np.array([3.0, -1.0, 7.0])
+    turned = np.zeros(11)
+    D_bias = motion.D_bias.copy()
+    up_j /= np.linalg.norm(up_j)
+    D_bias[:, 3:6] = np.vstack((np.outer(up_j, h), np.zeros((3, 3))))
+    factor = OdometryWithBias(X(0), X(1), B(0), replace(motion, D_bias=D_bias), up_j)
+    X_j = pose.compose(motion.i_T_j).compose(
+        gtsam.Pose3.Expmap(0.2 * rng.standard_normal(6))
+    )
+    bias = motion.bias
+    turned[3:6] = 0.05 * rng.standard_normal(3)
+    about_vertical = gtsam.Pose3(
+        gtsam.Rot3.Rz(h @ turned[3:6]).compose(X_j.rotation()), X_j.translation()
+    )
+    errors = [
+        factor.unwhitenedError(values_of(X0=pose, X1=x, B0=bias + b))
+        for x, b in ((X_j, 0.0 * bias), (about_vertical, turned))
+    ]
+    assert abs(h @ turned[3:6]) > 0.1
+    assert np.allclose(*errors, atol=1e-12)
+
+
 @poses
 @given(
     azimuth=st.floats(-1.13, 1.13),
@@ -208,6 +259,69 @@ def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(
     assert abs(up) < 1e-3
     predicted = range_azimuth(pose.compose(BODY_T_SONAR), values.atPoint3(L(0)))
     assert predicted == pytest.approx([range_m, azimuth], abs=1e-6)
+
+
+def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
+    """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is there."""
+    pose = POSES["random"]
+    point = seen_from(pose, 0.2, 0.05, 2.0)
+    upwards = seen_from(pose, 0.2, 0.05 + 1e-6, 2.0) - point
+    upwards /= np.linalg.norm(upwards)
+    values = values_of(X0=pose, L0=point)
+    z = np.array([2.0, 0.2])
+    cov = np.diag(SIGMA**2)
+    silent, told = (
+        information(
+            factors.landmark_sighting(
+                X(0), L(0), BODY_T_SONAR, z, cov, plain, s
+            ).values(),
+            values,
+            [L(0), X(0)],
+        )[:3, :3]
+        for s in (None, 0.07)
+    )
+    assert upwards @ silent @ upwards < 1e-6
+    assert upwards @ told @ upwards == pytest.approx(1 / (2.0 * 0.07) ** 2, rel=0.02)
+    assert np.sort(np.linalg.eigvalsh(silent))[1:] == pytest.approx(
+        [1 / 0.02**2, 1 / (0.009 * 2) ** 2], rel=0.02
+    )
+
+
+@poses
+def test_depth_is_the_height_of_the_port_and_nothing_else(pose):
+    port = np.array([0.3, -0.2, 0.1])
+    sigma = 0.02
+    height = float(
+        Rotation.from_matrix(pose.rotation().matrix()).apply(port)[2]
+        + pose.translation()[2]
+    )
+    factor = factors.depth(X(0), height - 0.05, port, sigma)
+    values = values_of(X0=pose)
+    assert factor.whitenedError(values)[2] == pytest.approx(0.05 / sigma)
+    assert np.abs(factor.whitenedError(values)[:2]).max() < 1e-3
+    eigenvalues = np.linalg.eigvalsh(information([factor], values, [X(0)]))
+    assert eigenvalues[-1] > 1 / sigma**2 > 1e9 * eigenvalues[-2]
+
+
+@poses
+@given(roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
+@settings(max_examples=10)
+def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch):
+    sigma = 0.01
+    up_in_body = pose.rotation().matrix().T @ [0, 0, 1.0]
+    truth = factors.gravity_direction(X(0), 9.8 * up_in_body, sigma)
+    assert np.allclose(truth.unwhitenedError(values_of(X0=pose)), 0, atol=1e-12)
+    yawed = gtsam.Pose3(gtsam.Rot3.Rz(1.3).compose(pose.rotation()), pose.translation())
+    assert np.allclose(truth.unwhitenedError(values_of(X0=yawed)), 0, atol=1e-12)
+    tilted = values_of(
+        X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3)))
+    )
+    angle = np.arccos(
+        np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1)
+    )
+    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(
+        2 * np.sin(angle / 2) / sigma, abs=1e-5
+    )
 
 
 @poses

@@ -1,16 +1,19 @@
 """Detections of a straight dive: gate, first place of a landmark, noise of the motion, waiting; steps of a policy."""
 
+import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Start
+from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
-from .dive import CALIBRATION, Dive
-from .made import smoother_with
+from .dive import CALIBRATION, SONAR, Dive, spherical
+from .graphs import block_of
+from .made import polar, smoother_with
 
 BEAM = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
 """Centre beam of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
@@ -19,6 +22,43 @@ CERTAIN = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
 
 def dive_with(smoother: Smoother | None = None, **changes) -> Dive:
     return Dive(CALIBRATION.model_copy(update=changes), smoother=smoother)
+
+
+def settle(dive: Dive, updates: int = 1) -> None:
+    for _ in range(updates):
+        dive.smoother.update(dive.keyframes.newest_s)
+
+
+def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
+    """S = H P H^T + R by numpy, with H by differences and P the window's joint covariance."""
+    dive = Dive()
+    truth = np.array([3.0, 0.8, -1.4])
+    dive.see(0.0, (5, *spherical(0.0, truth)))
+    settle(dive)
+    landmark = dive.smoother.values.atPoint3(L(5))
+    P = block_of(dive.smoother.joint_covariance([X(0), L(5)]), [X(0), L(5)])
+    world_T_body = dive.smoother.values.atPose3(X(0))
+
+    def expected(change: Floats) -> Floats:
+        pose = world_T_body.compose(gtsam.Pose3.Expmap(change[:6])).compose(
+            SONAR.mounting.pose()
+        )
+        return polar(pose, landmark + change[6:])
+
+    H = np.column_stack(
+        [(expected(1e-6 * a) - expected(-1e-6 * a)) / 2e-6 for a in np.eye(9)]
+    )
+    z = expected(np.zeros(9)) + np.array([0.03, -0.02])
+    dive.see(0.0, (5, *z))
+    log = dive.sightings.journal.log()
+    assert log.outcomes[-1] is Outcome.USED
+    assert log.innovations[-1] == pytest.approx([0.03, -0.02], abs=1e-9)
+    assert np.allclose(
+        log.innovation_covs[-1],
+        H @ P @ H.T + np.diag([0.02**2, 0.01**2]),
+        rtol=1e-5,
+        atol=1e-10,
+    )
 
 
 @pytest.mark.parametrize("beyond", [False, True])

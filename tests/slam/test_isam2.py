@@ -78,6 +78,21 @@ def poses_in(values: gtsam.Values) -> list[int]:
 PRECISE = {"smoother__lag_s": 1e6, "smoother__waiting_gain": 0.0}
 
 
+@pytest.mark.parametrize(
+    ("kernel", "bias"), [("none", 1.0), ("huber", 0.0), ("cauchy", 1.0)]
+)
+def test_incremental_equals_batch_in_the_basin(kernel, bias):
+    """iSAM2's own estimate, when it keeps all poses and relinearises what moved by a tenth of a milliradian."""
+    sequence = simulate_basin(
+        BasinOptions(duration_s=BASIN_S, laps=1, seed=3, gyro_bias_scale=bias)
+    )
+    estimator, _ = ran(
+        sequence, **PRECISE, kernel__shape=kernel, smoother__relinearize_threshold=1e-4
+    )
+    assert len(poses_in(estimator.values)) > 20
+    assert_is_batch(estimator.graph, estimator.values)
+
+
 @pytest.mark.slow
 @pytest.mark.recording
 def test_incremental_equals_batch_on_mrclam(unpacked):

@@ -1,6 +1,7 @@
 """Keyframes and the factors that they get from odometry, depth and gravity, on drives made by hand."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -11,8 +12,11 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import (
     Calibration,
+    DepthCalibration,
     DvlCalibration,
     ImuCalibration,
+    PlanarMotion,
+    Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu
 from sonar_graph.navigation import Odometry
@@ -89,6 +93,30 @@ def factor_of(keyframes: Keyframes, kind: type) -> gtsam.NonlinearFactor:
     return factor
 
 
+def test_every_keyframe_has_its_odometry_gravity_and_plane():
+    keyframes = driven(Calibration(imu=NO_BIAS), 6.0)
+    graph = keyframes.smoother.graph
+    assert graph.size() == 2 + 3 * 2
+    assert [
+        len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) for k in range(4)
+    ] == [0, 1, 1, 1]
+    assert [list(graph.at(k).keys()) for k in (2, 4, 6)] == [
+        [X(0), X(1)],
+        [X(1), X(2)],
+        [X(2), X(3)],
+    ]
+    without = Calibration(imu=NO_BIAS, use_gravity=False)
+    assert driven(without, 6.0).smoother.graph.size() == 2 + 3
+    keyframes = driven(without.model_copy(update={"planar": PlanarMotion()}), 6.0)
+    for kind in (gtsam.MagPoseFactorPose3, gtsam.GPSFactorArm):
+        assert [len(factors_on(keyframes, kind, X(k))) for k in range(4)] == [
+            1,
+            1,
+            1,
+            1,
+        ]
+
+
 def test_gravity_has_the_velocity_noise_of_both_ends():
     """Beside what the IMU adds: the change of a velocity with these sigmas at its ends, over 2 s and g."""
     ends = np.array([(0.1, 0.1), (0.2, 0.2), (0.1, 0.2), (0.2, 0.1)])
@@ -106,6 +134,43 @@ def test_gravity_has_the_velocity_noise_of_both_ends():
     assert np.diff(variances) == pytest.approx(
         np.diff((ends**2).sum(axis=1)) / (2.0 * G) ** 2, rel=1e-3, abs=1e-9
     )
+
+
+def test_depths_of_a_turning_vehicle_are_carried_by_its_motion():
+    """Mean port and sigma as from the exact path of a constant twist; the log's axes differ in noise."""
+    rate = np.array([0.3, 0.1, -0.2])
+    velocity = np.array([0.5, 0.2, -0.1])
+    port = np.array([0.4, -0.3, 0.2])
+    sigmas = np.array([0.002, 0.06, 0.004])
+    calibration = Calibration(
+        imu=ImuCalibration(gyro_noise_density=1e-9, gyro_bias_sigma=1e-9),
+        dvl=DvlCalibration(velocity_sigma_m_s=tuple(sigmas)),
+        depth=DepthCalibration(sigma_m=0.05, port_m=tuple(port)),
+        start=Start(rpy_rad=(0.3, -0.2, 0.5)),
+        use_gravity=False,
+    )
+    when = np.arange(0.15, 2.0, 0.25)
+    depth = Depth(at(*when), when, np.full(len(when), np.nan))
+    keyframes = driven(calibration, 2.0, depth, rate=rate, velocity=velocity)
+    factor = factor_of(keyframes, gtsam.GPSFactorArm)
+
+    def pose_at(t: float) -> gtsam.Pose3:
+        twist = np.r_[rate, velocity]
+        return calibration.start.pose().compose(gtsam.Pose3.Expmap(twist * t))
+
+    q = []  # variance of the way from each sample to the next, along the vertical
+    for begin, end in pairwise([*when, 2.0]):
+        ups = [pose_at(t).rotation().matrix()[2] for t in np.linspace(begin, end, 9)]
+        q.append(np.mean(np.square(ups) @ sigmas**2) * 0.2 * (end - begin))
+    weights, variance = average_at_end(np.full(len(when), 0.05**2), np.array(q))
+    end = pose_at(2.0)
+    ports = [end.transformTo(pose_at(t).transformFrom(port)) for t in when]
+    values = gtsam.Values()
+    for pose in (gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3.Roll(1.2), np.zeros(3))):
+        values.insert_or_assign(X(1), pose)
+        expected = pose.transformFrom(weights @ ports)[2] - weights @ when
+        assert factor.unwhitenedError(values)[2] == pytest.approx(expected, abs=2e-4)
+    assert factor.noiseModel().sigmas()[2] == pytest.approx(variance**0.5, rel=0.03)
 
 
 def test_the_bias_walks_between_stretches():

@@ -113,6 +113,25 @@ def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
     ) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_a_new_detections_components_are_predictive_densities() -> None:
+    """Of three landmarks, one of them across the cut of the azimuth; of one that is not in the graph, and of none."""
+    rng = np.random.default_rng(2)
+    A = rng.standard_normal((3, 2, 2))
+    S = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    z = np.array([3.0, 3.1])
+    expected = np.array([[3.2, 3.0], [2.0, -3.1], [3.5, 2.0]])
+    said = {4: 0.6, 5: 0.3}
+    found = MIXTURE.at_first(IdentityPosterior(said), [7, 4, 9], z, expected, S)
+    for k, i in enumerate((7, 4, 9)):
+        density = multivariate_normal.logpdf(
+            wrapped(z - expected[k]), np.zeros(2), S[k]
+        )
+        assert found[i] == pytest.approx(density + log_weights(said, i)[0])
+    assert found[5] == pytest.approx(LOG_U + log_weights(said, 5)[0])
+    assert found[None] == pytest.approx(LOG_U + log_weights(said, 5)[1])
+    assert found.keys() == {7, 4, 9, 5, None}
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""

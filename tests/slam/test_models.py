@@ -174,6 +174,24 @@ def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed
         assert cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] == pytest.approx(S, rel=1e-9)
 
 
+@keyframes
+def test_blurred_noise_is_the_noise_and_the_variances_of_the_motion(keyframe):
+    view, motion, landmarks, _ = some_view(keyframe, True)
+    R = np.array([[4e-4, 3e-5], [3e-5, 8e-5]])
+    H = numerical_of_view(keyframe, motion, landmarks[5])[:, 20:]
+    short = some_motion(9)
+    expected = R + np.diag(np.diag(H @ short.covariance @ H.T))
+    kept = R.copy()
+    assert np.allclose(
+        view.blurred(R[None], short, landmarks[5][None])[0],
+        expected,
+        rtol=1e-6,
+        atol=1e-12,
+    )
+    assert np.array_equal(R, kept)
+    assert np.all(np.diag(expected) > 1.01 * np.diag(R))
+
+
 @pytest.mark.parametrize(
     ("azimuth_sigma", "larger"),
     [(0.03, 25.0), (0.08, 64.0)],

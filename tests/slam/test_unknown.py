@@ -79,6 +79,55 @@ def blind(sequence: Sequence | None = None) -> Sequence:
     return anonymous_where(sequence or clean(), np.s_[:])
 
 
+def test_without_names_the_basin_is_that_with_names():
+    """Four landmarks, every detection used for the right one, and the poses of a run that knew them."""
+    sequence = clean()
+    true = clean().true_landmarks
+    known = run(sequence, smoother__relinearize_threshold=1e-3)
+    estimator = run(blind(), **ASSOCIATED)
+    landmarks = estimator.landmarks()
+    assert landmarks.ids.tolist() == [FIRST_ANONYMOUS_ID + k for k in range(4)]
+    apart_m = np.linalg.norm(
+        landmarks.positions[:, None, :2] - true.positions[None, :, :2], axis=-1
+    )
+    name_of = dict(
+        zip(
+            landmarks.ids.tolist(),
+            true.ids[np.argmin(apart_m, axis=1)].tolist(),
+            strict=True,
+        )
+    )
+    log = estimator.detections()
+    assert set(log.outcomes) <= USED
+    assert [
+        name_of[i] for i in log.landmark_ids.tolist()
+    ] == sequence.detections.most_probable()[0].tolist()
+    assert estimator.trajectory().positions == pytest.approx(
+        known.trajectory().positions, abs=1e-4
+    )
+
+
+def test_where_all_are_named_nothing_changes():
+    """Bit for bit, with false detections too, which a recogniser reports as of no landmark it knows."""
+    sequence = simulate_basin(BasinOptions(**TWO_LAPS, false_detections_per_frame=0.5))
+    one = run(sequence, smoother__relinearize_threshold=1e-3)
+    other = run(sequence, **ASSOCIATED)
+    assert np.array_equal(one.trajectory().positions, other.trajectory().positions)
+    assert one.detections().outcomes == other.detections().outcomes
+
+
+def test_a_landmark_begins_with_as_many_sightings_as_asked():
+    for least in (1, 8):
+        outcomes = Counter(
+            run(blind(), **ASSOCIATED, identity__unknown__sightings=least)
+            .detections()
+            .outcomes
+        )
+        assert outcomes[Outcome.PLACED_LATER] == 4 * (least - 1)
+        assert outcomes[Outcome.USED_LATER] == 0
+        assert outcomes[Outcome.NEW] == 4
+
+
 def test_scattered_detections_of_nothing_begin_no_landmark():
     """As many in a place as would begin one do not come within the time that they may wait."""
     options = BasinOptions(

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.aiding_messages import is_unwrapped
 from sonar_graph.measurements import UNMEASURED_M2
 
@@ -203,6 +204,32 @@ def imu_of(topic: str) -> Entry:
     return topic, *imu()[1:]
 
 
+def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(
+    foreign: Any,
+) -> None:
+    """A NavSatFix of any other name is; and an inspection offers no truth as a Doppler log."""
+    truth = fixes(fix(), fix(1.0), topic="/truth/fix")
+    assert foreign.read(truth).positions is None
+    assert len(foreign.read(truth, topics={"positions": "/truth/fix"}).positions) == 2
+    odometry = rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", [{}] * 2)
+    summary = inspect_log(foreign.write(imu(), odometry))
+    assert [
+        role.reason
+        for role in summary.roles
+        if role.role == "dvl" and "ground_truth" in role.reason
+    ] == []
+    assert (
+        "/ground_truth/odometry"
+        not in summary.toml.partition("[dvl]")[2].partition("[depth]")[0]
+    )
+    other = inspect_log(foreign.write(imu(), ("/odometry", *odometry[1:])))
+    assert any(
+        "/odometry only if chosen" in role.reason
+        for role in other.roles
+        if role.role == "dvl"
+    )
+
+
 def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
     rows = [
         {
@@ -302,3 +329,17 @@ def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not() -> No
     assert not is_unwrapped(np.degrees(turns))
     assert not is_unwrapped(np.degrees(turns) % 360)
     assert not is_unwrapped(turns + 90)
+
+
+@pytest.mark.parametrize(
+    "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
+)
+def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(
+    foreign: Any, said: dict[str, float]
+) -> None:
+    log = foreign.write(oriented(YAW, **said), dvl())
+    assert foreign.read(oriented(YAW, **said), dvl()).heading is None
+    (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]
+    assert role.topic is None
+    assert "/imu says of no orientation that it is measured" in role.reason
+    assert "needs_variance = false" in role.reason

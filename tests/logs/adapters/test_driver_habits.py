@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.logs import read_log, write_log
+from sonar_graph.logs.adapters.dvl_messages import repeats
 from sonar_graph.testing import small_world
 from tests.logs.adapters.conftest import imu, rows_of, tree
 from tests.logs.conftest import Entry, vector
@@ -135,6 +136,16 @@ def test_velocities_without_bottom_lock_are_left_out(
     )
 
 
+def test_a_velocity_mode_that_is_never_filled_does_not_count(foreign: Any) -> None:
+    entry = report(sent={"velocity_mode": 0}, lost={})
+    sequence = foreign.read(imu(ROWS), entry, tree("dvl_link", w=1.0))
+    assert len(sequence.dvl.stamps_ns) == ROWS
+    assert (
+        "velocity_mode and beam_velocities_valid are 0 in every message"
+        in sequence.notes["log.warnings"]
+    )
+
+
 def turning(row: int, **status: Any) -> dict[str, Any]:
     return {"angular_velocity": vector(0.01 * np.sin(row), 0, 0.1), **status}
 
@@ -178,6 +189,16 @@ def test_a_log_that_this_package_wrote_keeps_every_velocity(tmp_path: Path) -> N
     np.testing.assert_array_equal(with_whole.dvl.velocity, velocity)
 
 
+def test_a_held_velocity_is_a_drivers_habit_and_a_coarse_one_is_none() -> None:
+    fine = np.random.default_rng(0).standard_normal((60, 3))
+    held = np.repeat(fine, 2, axis=0)
+    assert repeats(held).sum() == 60
+    t = np.arange(120) * 0.1
+    coarse = np.round(np.column_stack([np.sin(t), np.cos(0.7 * t), 0 * t]), 1)
+    assert (np.diff(coarse, axis=0) == 0).all(axis=1).sum() > 20
+    assert not repeats(coarse).any()
+
+
 @pytest.mark.parametrize("times", [2, 5])
 def test_held_velocities_are_used_once(foreign: Any, times: int) -> None:
     """Water Linked's driver publishes ``~/odom`` once for each of two reports."""
@@ -192,3 +213,13 @@ def test_held_velocities_are_used_once(foreign: Any, times: int) -> None:
     sequence = foreign.read(imu(ROWS), odometry, tree("dvl_link", w=1.0))
     np.testing.assert_array_equal(sequence.dvl.stamps_ns, foreign.stamps(ROWS)[::times])
     assert "that repeat the velocity before" in sequence.notes["log.dropped"]
+
+
+def test_a_sensor_that_got_stuck_once_does_not_hold_velocities(
+    foreign: Any,
+) -> None:
+    stuck = report(lost={"velocity": velocity(20)})
+    assert (
+        len(foreign.read(imu(ROWS), stuck, tree("dvl_link", w=1.0)).dvl.stamps_ns)
+        == ROWS
+    )

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import read_log_config
+from sonar_graph.logs.adapters import SHIPPED, read_log_config
 from sonar_graph.logs.adapters.log_config import toml_value
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
@@ -53,6 +53,11 @@ def test_a_topic_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(MissingTopicError, match=message):
         foreign.read(toml=toml)
+
+
+SHIPPED_ADAPTERS = [
+    (role, offer.adapter) for role, offers in SHIPPED.items() for offer in offers
+]
 
 
 LEAVES = (

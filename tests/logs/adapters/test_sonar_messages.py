@@ -1,5 +1,6 @@
 """Sonar images of any driver as frames: order, samples, gains, bearings and ranges."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import inspect_log, read_sonar_frames
-from sonar_graph.logs.adapters import read_log_config
+from sonar_graph.logs.adapters import SHIPPED, read_log_config
+from sonar_graph.logs.cdr import definition, encode, parse_definition
+from sonar_graph.logs.mcap import Keep, Topic
 from sonar_graph.measurements import Floats
 
 from .conftest import Entry, dvl, imu, rows_of, vector
@@ -129,3 +132,67 @@ def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(
     )
     assert inspect_log(foreign.write(imu())).sonar is None
     assert frames_in(foreign, imu(), dvl()) == []
+
+
+@pytest.mark.recording
+def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
+    foreign: Any, recordings: Path
+) -> None:
+    raw = (recordings / "sonar" / "one_ping_8bit.raw").read_bytes()
+    bearings = np.round(np.linspace(-3000, 3000, 256)).astype(int).tolist()
+    sizes = {
+        "range_resolution": 2.0 / 703,
+        "n_ranges": 703,
+        "n_beams": 256,
+        "step": 256,
+        "bearings": bearings,
+    }
+    entry = pings(ping(ping_data=raw[2048 : 2048 + 256 * 703], **sizes))
+    (frames,) = frames_in(foreign, entry)
+    assert frames.intensity.shape == (1, 256, 703)
+    # neighbours along a beam and across beams look alike in the right order, and do not when it is transposed
+    (wrong,) = frames_in(foreign, entry, toml=BEAM_MAJOR + "\nrow_bytes = false")
+    right, other = (
+        sum(
+            np.abs(np.diff(f.intensity[0].astype(float), axis=axis)).mean()
+            for axis in (0, 1)
+        )
+        for f in (frames, wrong)
+    )
+    assert right < 0.8 * other
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        [],
+        [1],
+        [0, 1],
+    ],
+)
+def test_messages_that_are_no_image_are_refused_by_their_time(
+    bad: list[int],
+) -> None:
+    """Several messages may share an instant, sound ones and others."""
+    kind = "marine_acoustic_msgs/msg/ProjectedSonarImage"
+    times_ns = np.array([10, 10, 20, 30, 30, 30])
+    values = {"ranges": np.array([RANGES]), "image.dtype": 0, "image.beam_count": 3}
+    values |= {
+        f"beam_directions.{axis}": np.array([numbers])
+        for axis, numbers in zip("xyz", np.eye(3), strict=True)
+    }
+    values |= {"image.data": np.frombuffer(ROWS, np.uint8)[None], "header.stamp.sec": 1}
+    payload = encode(
+        parse_definition(kind, definition(kind)), 1, values, {"beam_directions": 3}
+    )[0].tobytes()
+    payloads = [payload[:-8] if row in bad else payload for row in range(len(times_ns))]
+    sizes = np.array([len(one) for one in payloads])
+    topic = Topic(
+        Path("a.mcap"), "/sonar", kind, "cdr", "ros2msg", definition(kind), Keep.ALL
+    )
+    topic.gather(b"".join(payloads), np.cumsum(sizes) - sizes, sizes, times_ns)
+    (adapter,) = (one.adapter for one in SHIPPED["sonar"] if one.adapter.type == kind)
+    refused: list[int] = []
+    blocks = list(adapter.read(topic, lambda stamp_ns, _: refused.append(stamp_ns)))
+    assert sorted(refused) == times_ns[bad].tolist()
+    assert sum(len(block) for block in blocks) == len(times_ns) - len(bad)

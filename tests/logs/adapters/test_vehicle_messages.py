@@ -3,6 +3,7 @@
 import re
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.adapters import range_and_azimuth
+from sonar_graph.logs.adapters import body_to_ros, range_and_azimuth
 
 from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
 
@@ -249,6 +250,34 @@ def test_axes_of_world_and_body_become_ours(
     np.testing.assert_array_equal(truth.positions, [position] * 3)
     np.testing.assert_allclose(
         truth.rotations().as_matrix(), [expected.as_matrix()] * 3, atol=1e-12
+    )
+
+
+def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, 6, 6))
+    return root @ root.transpose(0, 2, 1), Rotation.random(n, rng).as_matrix()
+
+
+def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
+    covariances, rotations = random_covariances(1, 1)
+    pose = gtsam.Pose3(gtsam.Rot3(rotations[0]), np.array([1.0, 2, 3]))
+    samples = np.random.default_rng(2).multivariate_normal(
+        np.zeros(6), covariances[0] * 1e-8, 20_000
+    )
+    moved = [pose.compose(gtsam.Pose3.Expmap(sample)) for sample in samples]
+    translations = np.array([m.translation() - pose.translation() for m in moved])
+    turns = np.array(
+        [
+            gtsam.Rot3.Logmap(m.rotation().compose(pose.rotation().inverse()))
+            for m in moved
+        ]
+    )
+    sampled = np.cov(np.hstack([translations, turns]).T) * 1e8
+    np.testing.assert_allclose(
+        sampled,
+        body_to_ros(covariances, rotations)[0],
+        atol=0.05 * np.abs(sampled).max(),
     )
 
 

@@ -258,6 +258,19 @@ def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path
     np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
 
 
+def test_a_second_line_of_the_header_with_units(folder, tmp_path):
+    d = dive()
+    k = d.slow
+    header = "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg"
+    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665e-3).T)
+    write(folder / "imu.csv", header, 1e3 * d.s, *columns, sep=";")
+    header = "Time;VelX;VelY;VelZ\nms;mm/s;mm/s;mm/s"
+    write(folder / "dvl.csv", header, 1e3 * d.s[k], *(1e3 * d.velocity[k]).T, sep=";")
+    header = "Time;Depth\nms;cm"
+    write(folder / "depth.csv", header, 1e3 * d.s[k], 100 * d.depth[k], sep=";")
+    assert_is(guessed(folder, tmp_path), d)
+
+
 def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
     d = dive()
     k = d.slow

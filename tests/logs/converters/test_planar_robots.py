@@ -121,6 +121,7 @@ def test_chain_of_relative_poses_is_the_composition_of_the_files_steps(recorded)
 # ---- MRCLAM: commands and barcodes
 
 T0 = 1248444187
+NS = 10**9
 
 
 @pytest.fixture
@@ -154,10 +155,62 @@ def folder(tmp_path):
     return tmp_path
 
 
+def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder):
+    (folder / "Robot1_Groundtruth.dat").write_text(f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n")
+    # of another robot
+    (folder / "Robot1_Measurement.dat").write_text(f"{T0}.2 14 1 0\n")
+    late = read_mrclam(folder, 1)
+    assert (len(late.truth), late.detections) == (2, None)
+    assert "origin" in late.notes["start"]
+    (folder / "Robot1_Groundtruth.dat").unlink()
+    never = read_mrclam(folder, 1)
+    assert never.truth is None
+    assert never.true_landmarks is not None
+    assert "no robot truth" in never.notes["truth"]
+    assert (
+        late.calibration.start.position_m
+        == never.calibration.start.position_m
+        == (0.0, 0.0, 0.0)
+    )
+
+
 @pytest.fixture(scope="module", params=[1, 2, 3, 4, 5])
 def sequence(request, unpacked):
     folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
     return read_mrclam(folder, request.param)
+
+
+@pytest.mark.recording
+class TestSet6:
+    """Against motion capture; bounds from docs/theory/datasets.md, with room."""
+
+    def test_detections_point_at_the_true_landmarks(self, sequence):
+        assert set(sequence.detections.candidate_ids[:, 0].tolist()) <= set(
+            range(6, 21)
+        )
+        assert sequence.true_landmarks.ids.tolist() == list(range(6, 21))
+        assert T0 - 20 < sequence.start_ns / NS < T0 + 20
+        d = sequence.detections
+        truth = sequence.truth
+        d = d.rows(
+            (d.stamps_ns >= truth.stamps_ns[0]) & (d.stamps_ns <= truth.stamps_ns[-1])
+        )
+        stamps, frame = np.unique(d.stamps_ns, return_inverse=True)
+        frames = truth.at(stamps)
+        world_R_body = frames.rotations()[frame]
+        position = frames.positions[frame]
+        where = np.searchsorted(sequence.true_landmarks.ids, d.candidate_ids[:, 0])
+        offset = world_R_body.inv().apply(
+            sequence.true_landmarks.positions[where] - position
+        )
+        azimuth = np.arctan2(offset[:, 1], offset[:, 0])
+        assert np.median(np.abs(d.range_m - np.hypot(*offset[:, :2].T))) < 0.15
+        assert np.median(np.abs(wrapped(d.azimuth_rad - azimuth))) < 0.02
+        assert np.median(np.abs(wrapped(-d.azimuth_rad - azimuth))) > 0.3
+
+
+def wrapped(angle):
+    return np.angle(np.exp(1j * angle))
 
 
 # ---- what is refused
