@@ -27,7 +27,8 @@ UP_OVER_S = 1.0
 STRETCH_S = 120.0
 """Rows are compared over so long at a time; longer, a drift of the gyros would bend the path."""
 FEWEST_ROWS = 6
-GAP_INTERVALS = 3.0
+GAP_INTERVALS = 2.5
+"""Typical intervals of the Doppler log from which an interval is a gap: two rows are missing, whatever the jitter."""
 LEAST_LEVEL = 0.05
 """Squared cosine of the pitch below which forward is not a level direction."""
 
