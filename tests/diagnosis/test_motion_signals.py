@@ -38,6 +38,16 @@ def without_imu(run: Sequence, begin_s: float, end_s: float) -> Sequence:
     return replace(run, imu=run.imu.rows((t <= begin_s) | (t >= end_s)))
 
 
+@pytest.mark.parametrize(("missing", "parts"), [(1, 1), (2, 2)])
+def test_two_missing_rows_of_a_slow_doppler_log_are_a_gap(missing: int, parts: int):
+    """Its velocity is not taken as linear over three seconds."""
+    t = (RUN.dvl.stamps_ns - RUN.dvl.stamps_ns[0]) * 1e-9
+    each_second = np.flatnonzero(np.diff(np.floor(t + 1e-6), prepend=-1.0) > 0)
+    kept = np.delete(each_second, slice(30, 30 + missing))
+    motion = motion_of(replace(RUN, dvl=RUN.dvl.rows(kept)))
+    assert len(np.unique(motion.parts)) == parts
+
+
 @pytest.mark.parametrize("bias", [0.0, 0.01])
 def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
     """A bias that the calibration knows is taken off."""
