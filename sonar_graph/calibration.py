@@ -341,11 +341,11 @@ class Start(Section):
     def covariance(self) -> NDArray[np.float64]:
         """Covariance of small rotations and shifts of the body in its own axes, rotation first, shape (6, 6).
 
-        A small rotation is ``J [d roll, d pitch, d yaw]``, where J is the inverse of the matrix of the paper's Euler
-        kinematics; a small shift is ``R' d``, where R is the attitude and d is along the world's axes.
+        A small rotation is ``W [d roll, d pitch, d yaw]``, W of docs/theory/ekf_slam.md, which takes Euler rates to body
+        rates. A small shift is ``R' d``, where R is the attitude and d is along the world's axes.
         """
         roll, pitch, _ = self.rpy_rad
-        J = np.array(
+        W = np.array(
             [
                 [1.0, 0.0, -np.sin(pitch)],
                 [0.0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
@@ -354,7 +354,7 @@ class Start(Section):
         )
         body_R_world = self.pose().rotation().matrix().T
         covariance = np.zeros((6, 6))
-        covariance[:3, :3] = J @ np.diag(np.square(self.rpy_sigma_rad)) @ J.T
+        covariance[:3, :3] = W @ np.diag(np.square(self.rpy_sigma_rad)) @ W.T
         covariance[3:, 3:] = (
             body_R_world @ np.diag(np.square(self.position_sigma_m)) @ body_R_world.T
         )
