@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.batch import KINDS, one_run
+from sonar_graph.batch import one_run
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.result_table import COLUMNS, is_timing
-from sonar_graph.batch.sources import LogOptions, SourceKind, fingerprint
+from sonar_graph.batch.sources import KINDS, LogOptions, SourceKind, fingerprint
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
