@@ -623,7 +623,10 @@ class FilterShell(ABC):
         landmark_id = int(views.ids[row])
         if landmark_id not in self._known.held:
             return
-        verdict = self._known.judge(landmark_id, views.e[row].copy(), views.S[row])
+        stamp_ns = int(views.stamp_ns[row])
+        verdict = self._known.judge(
+            landmark_id, stamp_ns, views.e[row].copy(), views.S[row]
+        )
         if verdict is Verdict.RELEASE:
             del self._slots[landmark_id]
 

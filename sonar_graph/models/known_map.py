@@ -2,9 +2,9 @@
 
 Every sighting of a landmark of the map is compared with its prediction, by the squared Mahalanobis distance of range and
 azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, or the landmark has moved. Wrong identities
-contradict here and there; a landmark that has moved is contradicted each time, and in the same way by one sighting and the
-next. So a landmark is contradicted from `FEWEST` such contradictions in a row on, where all contradictions are more than
-half of its sightings. As long as fewer landmarks are contradicted
+contradict here and there; a landmark that has moved is contradicted each time, and one contradiction follows the last one
+soon or is like it. So a landmark is contradicted from `FEWEST` such contradictions in a row on, where all contradictions
+are more than half of its sightings. As long as fewer landmarks are contradicted
 than agree, it has moved, and the estimator maps it again. Where as many are contradicted, the start may be wrong, or those
 that agree have moved: then their sightings are refused, and a message names both.
 """
@@ -23,7 +23,9 @@ from sonar_graph.states import LandmarkMap
 CONTRADICTS = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
 FEWEST = 3
-"""Number of alike contradictions in a row from which on a landmark may have moved."""
+"""Number of contradictions in a row from which on a landmark may have moved."""
+SOON_NS = 5_000_000_000
+"""Time between two contradictions of a landmark that wrong identities, which are spread over all landmarks, seldom make."""
 
 
 class Verdict(Enum):
@@ -49,10 +51,10 @@ class KnownLandmarks:
         """Identities with a sighting."""
         self._agreeing: Counter[int] = Counter()
         self._contradicting: Counter[int] = Counter()
-        self._last: dict[int, Floats] = {}
-        """Innovation of the last contradiction, by landmark."""
+        self._last: dict[int, tuple[int, Floats]] = {}
+        """Stamp and innovation of the last contradiction, by landmark."""
         self._in_a_row: Counter[int] = Counter()
-        """Contradictions that are like the one before, until now."""
+        """Contradictions that follow the one before soon, or are like it, until now."""
         self._elsewhere: set[int] = set()
         """Landmarks with `FEWEST` of them."""
 
@@ -61,7 +63,7 @@ class KnownLandmarks:
         """Mahalanobis distance from which on a sighting contradicts the map."""
         return math.sqrt(CONTRADICTS)
 
-    def judge(self, landmark_id: int, e: Floats, S: Floats) -> Verdict:
+    def judge(self, landmark_id: int, stamp_ns: int, e: Floats, S: Floats) -> Verdict:
         """Treatment of a sighting with an innovation of range and azimuth, shape (2,), and its covariance, (2, 2)."""
         if landmark_id not in self.held:
             return Verdict.USE
@@ -69,7 +71,7 @@ class KnownLandmarks:
         if e @ np.linalg.solve(S, e) <= CONTRADICTS:
             self._agreeing[landmark_id] += 1
             return Verdict.USE
-        self._contradict(landmark_id, e, S)
+        self._contradict(landmark_id, stamp_ns, e, S)
         contradicted = self._contradicted()
         if landmark_id not in contradicted or not self._is_outvoted(contradicted):
             return Verdict.REFUSE
@@ -80,13 +82,16 @@ class KnownLandmarks:
         self.held.discard(landmark_id)
         return Verdict.RELEASE
 
-    def _contradict(self, landmark_id: int, e: Floats, S: Floats) -> None:
+    def _contradict(
+        self, landmark_id: int, stamp_ns: int, e: Floats, S: Floats
+    ) -> None:
         """Count a contradiction."""
         self._contradicting[landmark_id] += 1
-        change = e - self._last.get(landmark_id, e)
+        last_ns, last_e = self._last.get(landmark_id, (stamp_ns, e))
+        self._last[landmark_id] = (stamp_ns, e)
+        change = e - last_e
         is_alike = change @ np.linalg.solve(2.0 * S, change) <= CONTRADICTS
-        self._last[landmark_id] = e
-        if not is_alike:
+        if not is_alike and stamp_ns - last_ns > SOON_NS:
             self._in_a_row[landmark_id] = 0
         self._in_a_row[landmark_id] += 1
         if self._in_a_row[landmark_id] >= FEWEST:

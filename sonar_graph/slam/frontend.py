@@ -230,8 +230,8 @@ class Frontend:
         for assignments in decision.rounds:
             self.landmarks.apply(assignments, self._keyframes.newest_s)
             self.update_if_due()
-        for landmark_id in decision.released:
-            self.landmarks.release(landmark_id, self._keyframes.newest_s)
+        if decision.released:
+            self.landmarks.release(decision.released, self._keyframes.newest_s)
 
     def _follow(self, changed: Changed) -> None:
         self.landmarks.follow(changed)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Sequence, Set
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
@@ -332,12 +332,13 @@ class LandmarkGraph:
         self._map_prior = self.smoother.add({"map prior": prior})
         self.follow(self.smoother.flush(time_s))
 
-    def release(self, landmark_id: int, time_s: float) -> None:
-        """Take a landmark that has moved out of the graph, with its sightings; the others keep their prior."""
-        fitted = self.sightings(landmark_id)
+    def release(self, landmark_ids: Sequence[int], time_s: float) -> None:
+        """Take landmarks that have moved out of the graph, with their sightings; the others keep their prior."""
+        fitted = [each for i in landmark_ids for each in self.sightings(i)]
         self.apply([Assignment(each, Outcome.UNFIT) for each in fitted], time_s)
-        del self._of[landmark_id]
-        del self._rooted[landmark_id]
+        for landmark_id in landmark_ids:
+            del self._of[landmark_id]
+            del self._rooted[landmark_id]
         rows = [k for k, i in enumerate(self.known.ids) if i in self.known.held]
         groups = []
         if rows:
@@ -350,7 +351,7 @@ class LandmarkGraph:
             groups.append(FactorGroup({"map prior": prior}))
         assert self._map_prior is not None
         changed = self.smoother.exchange(
-            time_s, [self._map_prior], groups, lost_landmarks=[L(landmark_id)]
+            time_s, [self._map_prior], groups, lost_landmarks=[*map(L, landmark_ids)]
         )
         if changed.added:
             self._map_prior = changed.added[0]

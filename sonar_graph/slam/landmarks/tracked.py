@@ -394,7 +394,7 @@ class TrackedIdentities(IdentityPolicy):
             squared = float(compared.distance[k])
             landmark_id = frame.ids[rows[k]]
             verdict = self.landmarks.known.judge(
-                landmark_id, compared.innovation[k], compared.S[k]
+                landmark_id, frame.stamp_ns, compared.innovation[k], compared.S[k]
             )
             if verdict is Verdict.RELEASE:
                 released.append(landmark_id)
