@@ -202,7 +202,7 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     start = sequence.calibration.start.in_map()
     note = f"{counted(len(known.ids), 'landmark')} of {path.name}"
     if start.source == "map":
-        note += "; the start is found in it, by identified landmarks"
+        note += "; the start is looked for in it, by identified landmarks"
     # the map has the measurements of this log in it already
     if known.source.startswith(f"{map_origin(sequence)}, "):
         warnings.append(
@@ -211,6 +211,9 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     changes = {"map": known, "start": start}
     calibration = sequence.calibration.model_copy(update=changes)
     notes = {**sequence.notes, "log.map": note}
+    if start.source == "map":
+        # no convention places the vehicle any more
+        notes.pop("log.start", None)
     if warnings:
         earlier = [notes["log.warnings"]] if "log.warnings" in notes else []
         notes["log.warnings"] = "; ".join([*earlier, *warnings])

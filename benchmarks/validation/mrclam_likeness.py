@@ -74,8 +74,8 @@ def robot_figures(folder: Path, robot: int) -> dict[str, Any]:
     log = read_mrclam(folder, robot)
     middle_ns = (log.start_ns + log.end_ns) // 2
     first = between(log, log.start_ns - 1, middle_ns)
-    rho, pairs = likeness(run_estimator(first, "ekf-slam").detections)
-    factors = np.sqrt((1.0 + rho) / (1.0 - rho))
+    found_alike = likeness(run_estimator(first, "ekf-slam").detections)
+    factors = found_alike.sigma_factors()
     true = log.true_landmarks
     known = KnownMap.of(true.ids, true.positions, sigma_m=SURVEY_SIGMA_M)
     second = between(log, middle_ns, log.end_ns)
@@ -91,7 +91,10 @@ def robot_figures(folder: Path, robot: int) -> dict[str, Any]:
         "advised": with_calibration(second, sonar=wider),
         "shuffled": between(shuffled(log, robot), middle_ns, log.end_ns),
     }
-    found: dict[str, Any] = {"likeness": rho.tolist(), "pairs": pairs}
+    found: dict[str, Any] = {
+        "likeness": found_alike.correlation.tolist(),
+        "factors": factors.tolist(),
+    }
     for label, sequence in runs.items():
         unsure = started(sequence, *FIELD_START, robot + 10 * robot)
         one = run("ekf-slam", unsure, known)
@@ -109,11 +112,11 @@ def main() -> None:
         found = resumed(arguments.resume, 1, figures, chosen, "robot")
     rows = []
     for robot, one in zip(chosen, found, strict=True):
-        cells = [f"{value:.2f}" for value in one["likeness"]]
+        cells = [f"{value:.2f}" for value in one["likeness"] + one["factors"]]
         for label in ("as it is", "advised", "shuffled"):
             cells += [f"{one[label]['rms_m']:.3f}", f"{one[label]['nees']:.2f}"]
         rows.append((robot, *cells))
-    heads = ["robot", "likeness of range", "of azimuth"]
+    heads = ["robot", "likeness of range", "of azimuth", "sigma times", "azimuth"]
     for label in ("as it is", "advised", "shuffled"):
         heads += [f"{label}: error, m", "NEES"]
     print_table(heads, rows)

@@ -184,8 +184,19 @@ class Likeness(NamedTuple):
 
     correlation: Floats
     """Of range and of azimuth, shape (2,); 0 where innovations are white."""
+    mean_square: Floats
+    """Of the innovations over their sigmas, shape (2,)."""
     pairs: int
     """Number of pairs of sightings."""
+
+    def sigma_factors(self) -> Floats:
+        """Factors of the sigmas of range and azimuth by which means of such errors have their variance, shape (2,).
+
+        The mean of errors with the correlation rho from one to the next has ``(1 + rho) / (1 - rho)`` times the variance
+        that it has without (Bayley, Hammersley 1946).
+        """
+        rho = self.correlation
+        return np.asarray(np.sqrt(self.mean_square * (1.0 + rho) / (1.0 - rho)))
 
 
 def likeness(log: DetectionLog) -> Likeness:
@@ -226,7 +237,8 @@ def likeness(log: DetectionLog) -> Likeness:
     correlation = np.divide(
         shared, np.sqrt(squares), out=np.zeros(2), where=squares > 0
     )
-    return Likeness(correlation, int(is_pair.sum()))
+    mean_square = np.mean(u**2, axis=0) if len(u) else np.zeros(2)
+    return Likeness(correlation, mean_square, int(is_pair.sum()))
 
 
 def mean_normalised(squares: Floats, dof: int) -> float:

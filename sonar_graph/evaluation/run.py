@@ -531,7 +531,8 @@ class _Replay:
         detections = estimator.detections()
         self._stage = "at the end, outcome checked"
         if not self._estimates:
-            raise EvaluationError("process never returned an estimate")
+            reasons = "; ".join(withheld_of(estimator))
+            raise EvaluationError(reasons or "process never returned an estimate")
         returned(smoothed, Trajectory, "trajectory()")
         returned(landmarks, LandmarkMap, "landmarks()")
         returned(detections, DetectionLog, "detections()")

@@ -159,9 +159,11 @@ class KnownLandmarks:
         if moved:
             lines.append(moved_line(moved, is_mapped_again=self._may_release))
         if contradicted:
+            # two that contradict it, and none that agrees
+            surely = " beyond doubt" * (len(contradicted) > 1 and not self._agreeing)
             lines.append(
-                f"{named(contradicted)}: sightings contradict the map, and too few others agree with it: landmarks have "
-                "moved, or the start or the map is wrong; `sonar-graph inspect LOG --map FILE` checks both"
+                f"{named(contradicted)}: sightings contradict the map{surely}, and too few others agree with it: "
+                "landmarks have moved, or the start or the map is wrong; `sonar-graph inspect LOG --map FILE` checks both"
             )
         unseen = [i for i in self.ids if i not in self.seen]
         if unseen:

@@ -50,6 +50,8 @@ OUTLYING_SHARE = 0.05
 # correlation of the innovations of successive sightings from which they are named, and the fewest pairs of sightings
 ALIKE = 0.5
 FEWEST_PAIRS = 100
+# factor of a sigma from which it is said
+LEAST_FACTOR = 1.5
 # findings about the reference, which no estimator uses
 REFERENCE = "reference"
 MOST_NAMED = 5
@@ -390,9 +392,8 @@ def absurd_detections(run: RunResult) -> tuple[int, int]:
 def alike_errors(comparison: Comparison) -> list[str]:
     """A warning each for range and azimuth where successive sightings of a landmark err alike (`likeness`).
 
-    The mean of errors with the correlation rho from one to the next has ``(1 + rho) / (1 - rho)`` times the variance
-    that it has without (Bayley, Hammersley 1946). None where a sensor of the vehicle is in doubt, or innovations are
-    absurd: these are the cause then, and have lines of their own.
+    By the run in which they are least alike. None where a sensor of the vehicle is in doubt, or innovations are absurd:
+    these are the cause then, and have lines of their own.
     """
     sequence = comparison.sequence
     # the worst finding comes first
@@ -403,38 +404,33 @@ def alike_errors(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         far, of = absurd_detections(run)
         if run.detections is not None and far <= OUTLYING_SHARE * of:
-            found.append((run.estimator, likeness(run.detections)))
+            each = likeness(run.detections)
+            if each.pairs >= FEWEST_PAIRS:
+                found.append((run.estimator, each))
     noise = (
         sequence.detections.range_azimuth_cov if sequence.detections else np.empty(0)
     )
     is_logged = bool(np.isfinite(noise).any())
     sonar = sequence.calibration.sonar
-    sigmas = {
-        "range_sigma_m": sonar.range_sigma_m,
-        "azimuth_sigma_rad": sonar.azimuth_sigma_rad,
-    }
+    sigmas = (sonar.range_sigma_m, sonar.azimuth_sigma_rad)
     lines = []
-    for column, (key, sigma) in enumerate(sigmas.items()):
-        rho, pairs, name = max(
-            (
-                (float(each.correlation[column]), each.pairs, name)
-                for name, each in found
-                if each.pairs >= FEWEST_PAIRS
-            ),
-            default=(0.0, 0, ""),
-        )
-        if rho <= ALIKE:
+    for column, key in enumerate(("range_sigma_m", "azimuth_sigma_rad")):
+        if not found:
+            break
+        name, least = min(found, key=lambda one: one[1].correlation[column])
+        rho = least.correlation[column]
+        factor = least.sigma_factors()[column]
+        if rho <= ALIKE or factor <= LEAST_FACTOR:
             continue
-        factor = float(np.sqrt((1.0 + rho) / (1.0 - rho)))
         remedy = (
             f"give sigmas {factor:.1f} times as large with the detections"
             if is_logged
-            else f"write `{key} = {factor * sigma:.2g}` under [sonar]"
+            else f"write `{key} = {factor * sigmas[column]:.2g}` under [sonar]"
         )
         lines.append(
             f"{WARNING}: {name}: errors of {key.split('_')[0]} are alike in successive sightings of a landmark "
-            f"(correlation {rho:.2f} in {pairs} pairs, 0 where independent): covariances are too small, also where NIS "
-            f"is below 1; {remedy}, or mend a constant error of the sonar"
+            f"(correlation {rho:.2f} in {least.pairs} pairs, 0 where independent): covariances are too small, also where "
+            f"NIS is below 1; mend a constant error of sonar, start or gyros, else {remedy}"
         )
     return lines
 

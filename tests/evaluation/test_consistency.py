@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -142,6 +144,22 @@ def test_likeness_is_the_correlation_of_successive_sightings_of_a_landmark():
         found = consistency.likeness(sightings(rho))
         assert found.pairs == 1998
         np.testing.assert_allclose(found.correlation, [rho, 0.0], atol=0.05)
+        np.testing.assert_allclose(found.mean_square, 1.0, atol=0.15)
+        # of the mean of many errors
+        expected = [np.sqrt((1 + rho) / (1 - rho)), 1.0]
+        np.testing.assert_allclose(found.sigma_factors(), expected, rtol=0.15)
+    wider = sightings(0.8)
+    wider = replace(
+        wider,
+        innovation_covs=wider.innovation_covs * np.linspace(1, 9, 2000)[:, None, None],
+    )
+    in_sigmas = wider.innovations / np.sqrt(
+        np.diagonal(wider.innovation_covs, axis1=1, axis2=2)
+    )
+    a = np.concatenate([in_sigmas[0:-2:2, 0], in_sigmas[1:-2:2, 0]])
+    b = np.concatenate([in_sigmas[2::2, 0], in_sigmas[3::2, 0]])
+    expected_rho = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
+    assert consistency.likeness(wider).correlation[0] == pytest.approx(expected_rho)
     # sightings that are 2.2 s apart are no pairs, and what was refused is no sighting
     assert consistency.likeness(sightings(0.8, step_s=1.1)).pairs == 0
     refused = consistency.likeness(sightings(0.8, outcome=Outcome.GATED))

@@ -477,22 +477,39 @@ def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_
     rng = np.random.default_rng(3)
     noise = rng.standard_normal(400)
 
-    def said(rho: float, count: int = 400, **changes: Any) -> list[str]:
+    def said(
+        rho: float, count: int = 400, size: float = 1.0, **changes: Any
+    ) -> list[str]:
         errors = noise[:count].copy()
         for k in range(1, count):
             errors[k] = rho * errors[k - 1] + np.sqrt(1 - rho**2) * noise[k]
-        log = log_of([Outcome.USED] * count, (SIGMA_M * errors).tolist())
+        innovations_m = size * SIGMA_M * errors
+        log = log_of([Outcome.USED] * count, innovations_m.tolist())
         comparison = with_map(IDS, [0.0] * 4, detections=log)
+        runs = [run for run in comparison.runs if run.estimator == "isam2"]
         sequence = replace(comparison.sequence, **changes)
-        return sentences.alike_errors(replace(comparison, sequence=sequence))
+        return sentences.alike_errors(replace(comparison, sequence=sequence, runs=runs))
 
     (line,) = said(0.8)
     rho = float(re.search(r"correlation ([.0-9]+) in 399 pairs", line)[1])
     assert rho == pytest.approx(0.8, abs=0.1)
     assert line.startswith("Warning: isam2: errors of range are alike")
-    assert "times as large with the detections" in line or "range_sigma_m" in line
+    # by hand: the mean of such errors has (1 + rho) / (1 - rho) times the variance
+    sequence = basin_comparison(60).sequence
+    expected_m = 3.0 * sequence.calibration.sonar.range_sigma_m
+    sigma_m = float(re.search(r"`range_sigma_m = ([.0-9]+)` under", line)[1])
+    assert sigma_m == pytest.approx(expected_m, rel=0.3)
+    # the sigma is large enough already
+    assert said(0.8, size=0.3) == []
+    n = len(sequence.detections)
+    logged = np.tile(np.diag([0.01, 1e-4]), (n, 1, 1))
+    detections = replace(sequence.detections, range_azimuth_cov=logged)
+    (line,) = said(0.8, detections=detections)
+    factor = float(re.search(r"give sigmas ([.0-9]+) times", line)[1])
+    assert factor == pytest.approx(3.0, rel=0.3)
     assert said(0.0) == []
     assert said(0.8, count=90) == []
+    assert said(0.8, size=30.0) == [], "absurd ones have a line of their own"
     assert said(0.8, notes={"log.doubtful": "depth against dvl: sign"}) == []
     assert said(0.8, notes={"log.sensors": "dvl against imu: scale"}) == []
-    assert said(0.8, notes={"log.sensors": "reference against IMU: late"}) == [line]
+    assert len(said(0.8, notes={"log.sensors": "reference against IMU: late"})) == 1
