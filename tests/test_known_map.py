@@ -486,6 +486,28 @@ def test_a_right_map_has_no_finding(dive):
     assert not list(map_findings(with_map(dive, None)))
 
 
+def test_a_map_of_another_place_is_not_passed_in_silence(dive):
+    known = surveyed(dive)
+    shuffled = np.random.default_rng(3).permutation(known.ids).tolist()
+    other = KnownMap.of(shuffled, known.positions_m, sigma_m=SIGMA_M)
+    (finding,) = map_findings(with_map(dive, other))
+    assert "the sightings give no single place in the map" in finding.text()
+    # with a stated start nothing agrees, which puts the results in doubt
+    estimator, _ = run(EkfSlam, with_map(dive, other))
+    assert any(
+        "contradict the map beyond doubt" in line for line in estimator.withheld()
+    )
+
+
+def test_a_run_that_is_not_located_gives_the_reason(dive):
+    known = surveyed(dive)
+    shuffled = np.random.default_rng(3).permutation(known.ids).tolist()
+    other = KnownMap.of(shuffled, known.positions_m, sigma_m=SIGMA_M)
+    lost = with_map(dive, other, unknown_start(dive))
+    (failed,) = compare(lost, ["ekf-slam"]).failed_runs
+    assert "not yet located in the map" in failed.reason
+
+
 def test_sigmas_of_a_map_that_are_too_small_are_named(dive):
     errors = 0.4 * np.random.default_rng(5).standard_normal((12, 3))
     known = KnownMap.of(

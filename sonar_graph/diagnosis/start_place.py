@@ -19,7 +19,6 @@ from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     IN_CALIBRATION,
     Finding,
-    Gravity,
     contradiction,
     numbers,
     unknown,
@@ -87,14 +86,6 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
     if fit.is_checked and fit.start is None:
         why = "the sightings give no single place in the map: it is of another place, landmarks moved, or stand in a row"
         yield Finding("map: places", unknown(why))
-    if fit.moved:
-        yield Finding(
-            "map: places",
-            unknown("some landmarks are elsewhere"),
-            cause=f"landmarks that are not where the map has them: {listed(fit.moved)}",
-            line="correct the map, or its sigmas; a run maps them again",
-            gravity=Gravity.ACT,
-        )
     start = right.calibration.start
     if fit.start is None or start.source == "map":
         return

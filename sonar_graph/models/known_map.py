@@ -24,6 +24,8 @@ CONTRADICTS = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
 FEWEST = 3
 """Number of contradictions in a row from which on a landmark may have moved."""
+SURE_TIMES = 3
+"""Times as many landmarks contradict the map as agree with it, from which on it, or the start, is wrong beyond doubt."""
 SOON_NS = 5_000_000_000
 """Time between two contradictions of a landmark that wrong identities, which are spread over all landmarks, seldom make."""
 
@@ -159,8 +161,10 @@ class KnownLandmarks:
         if moved:
             lines.append(moved_line(moved, is_mapped_again=self._may_release))
         if contradicted:
-            # two that contradict it, and none that agrees
-            surely = " beyond doubt" * (len(contradicted) > 1 and not self._agreeing)
+            agreeing = (self.held & self.seen).difference(contradicted, moved)
+            # a few may agree by chance
+            is_sure = len(contradicted) > max(1, SURE_TIMES * len(agreeing))
+            surely = " beyond doubt" if is_sure else ""
             lines.append(
                 f"{named(contradicted)}: sightings contradict the map{surely}, and too few others agree with it: "
                 "landmarks have moved, or the start or the map is wrong; `sonar-graph inspect LOG --map FILE` checks both"

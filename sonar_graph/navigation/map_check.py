@@ -18,7 +18,6 @@ import numpy as np
 from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Measurements
 from sonar_graph.navigation.map_start import (
-    MOST_OF_LANDMARK,
     ODDS,
     FoundStart,
     MapLocator,
@@ -26,7 +25,6 @@ from sonar_graph.navigation.map_start import (
     candidates,
     located,
     map_data,
-    moved_landmarks,
     newest_of_each,
 )
 from sonar_graph.sequence import Sequence
@@ -76,8 +74,6 @@ class MapFit(NamedTuple):
     """Change of the map that undoes it."""
     is_checked: bool = True
     """False where fewer than `FEWEST` landmarks were seen, and nothing else shows a mistake."""
-    moved: tuple[int, ...] = ()
-    """Identities of the landmarks that are seen elsewhere than the map has them."""
 
 
 def map_fit(sequence: Sequence) -> MapFit:
@@ -106,9 +102,7 @@ def map_fit(sequence: Sequence) -> MapFit:
     if swaps:
         return MapFit(None, *of_swaps(swaps))
     if start is not None:
-        of_all = newest_of_each(given.sightings, MOST_OF_LANDMARK)
-        moved = moved_landmarks(start, map_data(of_all, known))
-        return MapFit(start, moved=tuple(known.ids[row] for row in moved))
+        return MapFit(start)
     for mistake, T in MISTAKES.items():
         corrected = followed(sequence, undone(known, T))
         if fits(corrected.newest(), corrected.map):
