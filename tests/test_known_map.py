@@ -288,20 +288,35 @@ def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
     assert message.startswith("not yet located in the map")
 
 
+FROM_THE_START = np.array([40.0, 60.0])
+"""Place of the start in a map, m."""
+SEEN_M2 = np.diag([0.1**2, 0.1**2])
+
+
+def random_map(rng: np.random.Generator, count: int) -> KnownMap:
+    places = np.column_stack([rng.uniform(0, 100, (count, 2)), np.full(count, -4.0)])
+    return KnownMap.of(range(count), places, sigma_m=0.05)
+
+
+def seen_from_start(known: KnownMap, row: int, shift_m: float = 0.0) -> MapSighting:
+    """A landmark where the map has it, or to the east of it."""
+    place = np.array(known.positions_m[row][:2])
+    return MapSighting(row, place - FROM_THE_START + [shift_m, 0.0], SEEN_M2)
+
+
 @pytest.mark.parametrize(("others", "is_found"), [(1, True), (7, False)])
 def test_three_landmarks_that_agree_are_no_start_where_most_do_not(others, is_found):
     """Seven wrong identities of ten mean a map of another place, one of four does not."""
     rng = np.random.default_rng(1)
-    places = np.column_stack([rng.uniform(0, 100, (10, 2)), np.full(10, -4.0)])
-    known = KnownMap.of(range(10), places, sigma_m=0.05)
-    t = np.array([40.0, 60.0])
-    S = np.diag([0.1**2, 0.1**2])
-    right = [MapSighting(i, places[i, :2] - t, S) for i in range(3)]
-    wrong = [MapSighting(3 + i, rng.uniform(-50, 50, 2), S) for i in range(others)]
+    known = random_map(rng, 10)
+    right = [seen_from_start(known, i) for i in range(3)]
+    wrong = [
+        MapSighting(3 + i, rng.uniform(-50, 50, 2), SEEN_M2) for i in range(others)
+    ]
     found = located(right + wrong, known)
     assert (found is not None) == is_found
     if found is not None:
-        np.testing.assert_allclose(found.parameters, [0.0, *t], atol=0.5)
+        np.testing.assert_allclose(found.parameters, [0.0, *FROM_THE_START], atol=0.5)
 
 
 def test_a_third_landmark_far_from_two_others_agrees_with_their_start():
@@ -332,13 +347,10 @@ def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):
 
 def test_landmarks_that_stand_elsewhere_have_moved_and_wrong_identities_not():
     rng = np.random.default_rng(2)
-    places = np.column_stack([rng.uniform(0, 100, (6, 2)), np.full(6, -4.0)])
-    known = KnownMap.of(range(6), places, sigma_m=0.05)
-    t = np.array([40.0, 60.0])
-    S = np.diag([0.1**2, 0.1**2])
-    right = [MapSighting(i, places[i, :2] - t, S) for i in range(4)]
-    moved = [MapSighting(4, places[4, :2] - t + [1.5, 0.0], S) for _ in range(3)]
-    scattered = [MapSighting(5, rng.uniform(-50, 50, 2), S) for _ in range(4)]
+    known = random_map(rng, 6)
+    right = [seen_from_start(known, i) for i in range(4)]
+    moved = [seen_from_start(known, 4, shift_m=1.5) for _ in range(3)]
+    scattered = [MapSighting(5, rng.uniform(-50, 50, 2), SEEN_M2) for _ in range(4)]
     data = map_data(right + moved + scattered, known)
     found = located(right + moved + scattered, known)
     assert moved_landmarks(found, data) == [4]

@@ -257,8 +257,11 @@ def test_heading_and_fixes_tell_the_rows_whose_noise_cannot_be():
     indefinite = good.copy()
     infinite = good.copy()
     unknown = good.copy()
-    skew[0, 1], infinite[2, 2], unknown[0, 0] = 1.8, np.inf, np.nan
-    indefinite[0, 1] = indefinite[1, 0] = 2.1
+    skew[0, 1] = 1.8
+    infinite[2, 2] = np.inf
+    unknown[0, 0] = np.nan
+    indefinite[0, 1] = 2.1
+    indefinite[1, 0] = 2.1
     # indefinite, though no pair of axes is
     cyclic = np.array([[1.0, 0.9, 0.9], [0.9, 1.0, -0.9], [0.9, -0.9, 1.0]])
     sound = [good, 1e-9 * good, good.astype(np.float32), unknown]
