@@ -23,7 +23,23 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from baselines.events import Motion, Sighted, Sonar, Views, elevation_of_new
+from baselines.events import (
+    DEPTH,
+    EPOCH,
+    NO_ROW,
+    UNKNOWN,
+    Events,
+    Motion,
+    Sonar,
+    Surroundings,
+    Views,
+    elevation_of_new,
+    feel,
+    in_frame,
+    is_followed,
+    motion_to,
+    remove_rate,
+)
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
@@ -52,6 +68,7 @@ from sonar_graph.models import (
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import (
     O3,
+    ZERO,
     Mat3,
     Mat6,
     Vec3,
@@ -228,13 +245,17 @@ def move(x: Floats, by: Floats) -> None:
 
 @compiled
 def observe(
-    x: Floats, P: Floats, motion: Motion, sonar: Sonar, views: Views, sighted: Sighted
-) -> None:
-    """Update by range and azimuth of known landmarks, one after the other; writes outcome, e of (7) and S of each."""
+    x: Floats, P: Floats, motion: Motion, sonar: Sonar, views: Views, first: int
+) -> int:
+    """Update by range and azimuth of known landmarks, one after the other; writes outcome, e of (7) and S of each.
+
+    From one row of a frame on; returns the row of the next landmark that is not known, `NO_ROW` without any.
+    """
     mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
-    for k in range(len(sighted.rows)):
-        row = sighted.rows[k]
-        at = MAP + LANDMARK * sighted.slots[k]
+    for row in in_frame(views, first):
+        if views.slot[row] == UNKNOWN:
+            return row
+        at = MAP + LANDMARK * views.slot[row]
         z = views.z[row]
         R_z = views.R_z[row]
         R, X, T = pose_after(x, motion)
@@ -250,10 +271,11 @@ def observe(
         noise = view_noise(sight, motion, R_z)
         HP, S = innovation_of(P, H, noise)
         # the kernel widens the noise of the detection, not that of the motion
-        outcome, widened = judged(e, S, R_z, sighted.gates[k], sonar.kernel_width)
+        outcome, widened = judged(e, S, R_z, views.gate[row], sonar.kernel_width)
         if outcome != GATED:
             move(x, correction(P, HP, S + widened, e))
         write_judged(views, row, outcome, e, S)
+    return NO_ROW
 
 
 @compiled
@@ -268,6 +290,40 @@ def update_depth(
     store_row6(T.T @ h_b, H, 0, 0)
     e = np.array([z_m - X.z - R.z @ q])
     update(x, P, H, e, np.array([[h_b @ (mat6(motion.C) @ h_b) + variance_m2]]))
+
+
+@compiled
+def follow(
+    x: Floats, P: Floats, events: Events, around: Surroundings, first: int
+) -> int:
+    """Predict to epochs, update by depths and frames, in turn from one event on; the number of the event that is next.
+
+    It stops before a frame with a new landmark, and after an epoch at which more is measured, or where the Euler angles
+    are singular.
+    """
+    order = events.order
+    k = first
+    while is_followed(events, around, k, first):
+        motion = motion_to(events, k)
+        # a motion over a gap has been reduced
+        if around.has_rate and not events.is_gap[k]:
+            R = rotation_from_euler(x[ROLL], x[PITCH], x[YAW])
+            motion = remove_rate(motion, ZERO, R.T @ vec(around.earth_rad_s))
+        row = order.row[k]
+        if order.kind[k] == EPOCH:
+            predict(x, P, motion)
+            # gravity is compared with the specific force in the frame where its interval began
+            feel(around.felt, motion)
+            if order.has_more[k] or abs(x[PITCH]) >= MOST_PITCH_RAD:
+                return k + 1
+        elif order.kind[k] == DEPTH:
+            z_m = events.value[row, 2]
+            variance_m2 = events.noise[row, 2, 2]
+            update_depth(x, P, motion, around.port_m, z_m, variance_m2)
+        elif observe(x, P, motion, around.sonar, events.views, row) != NO_ROW:
+            return k
+        k += 1
+    return k
 
 
 @compiled
@@ -341,13 +397,13 @@ class EkfSlam(FilterShell):
         """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
         return self.node_ns, self._x.copy(), self._P.copy()
 
-    def predict(self, motion: Motion, duration_s: float) -> None:  # noqa: ARG002  # nothing walks
-        """Carry the state over the motion to the next epoch."""
-        predict(self._x, self._P, motion)
+    def follow(self, events: Events, first: int) -> int:
+        """Predict to epochs, update by depths and frames, in turn; the number of the event that is next."""
+        return follow(self._x, self._P, events, self.around, first)
 
-    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+    def observe(self, motion: Motion, views: Views, first: int) -> int:
         """Update by range and azimuth of known landmarks, (6) and (7)."""
-        observe(self._x, self._P, motion, self.sonar, views, sighted)
+        return observe(self._x, self._P, motion, self.sonar, views, first)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
@@ -394,10 +450,6 @@ class EkfSlam(FilterShell):
                 np.array([sonar.floor_z_m - p[2]]),
                 [sonar.floor_variance_m2],
             )
-
-    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
-        """Update by the height of the pressure port."""
-        update_depth(self._x, self._P, motion, self.port, z_m, variance_m2)
 
     def update_heading(
         self, motion: Motion, yaw_rad: float, variance_rad2: float

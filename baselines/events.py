@@ -1,6 +1,6 @@
 """Events of a call of a filter in their order, and the motions that lead to them.
 
-A filter's state sits at an epoch, a stamp of the Doppler log. Events happen in the order of their stamps, whatever the
+A filter's state is that of an epoch, a stamp of the Doppler log. Events happen in the order of their stamps, whatever the
 calls in which measurements arrive: an epoch when it is reached, a depth sample, a heading, a position fix, then the
 detections of a frame. A measurement is related to the newest epoch reached by then, through a motion from rows stamped
 no later::
@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import ACCEPTED, Mount, floor_elevation
+from sonar_graph.motion import Motions
 from sonar_graph.numerics import (
     LOWER_LEFT,
+    Vec3,
     compiled,
     cross,
     exp_and_mean,
+    inlined,
     mat,
     store,
     store_vector,
@@ -31,6 +34,8 @@ from sonar_graph.numerics import (
 
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first."""
+UNKNOWN = -1
+NO_ROW = -1
 NOT_STARTED = int(np.iinfo(np.int64).max)
 LONG_AGO = int(np.iinfo(np.int64).min)
 
@@ -70,17 +75,6 @@ class Sonar(NamedTuple):
         return Mount(self.body_R_sonar, self.body_p_sonar)
 
 
-class Sighted(NamedTuple):
-    """Views of known landmarks in one frame, in their order, m of them."""
-
-    rows: Ints
-    """Their numbers among the views, shape (m,)."""
-    slots: Ints
-    """Numbers of the landmarks in the state, shape (m,)."""
-    gates: Floats
-    """Mahalanobis distances beyond which they are refused, shape (m,)."""
-
-
 class Samples(NamedTuple):
     """Depths, headings and position fixes of a call, in order."""
 
@@ -98,6 +92,10 @@ class Views(NamedTuple):
     stamp_ns: Ints
     ids: Ints
     """Identity of the landmark that is most probable."""
+    slot: Ints
+    """Number of that landmark in the state; `UNKNOWN` of one that is not in it."""
+    gate: Floats
+    """Mahalanobis distance beyond which the detection is refused."""
     z: Floats
     R_z: Floats
     outcome: NDArray[np.int8]
@@ -154,6 +152,11 @@ class Felt(NamedTuple):
         """At the start of an interval."""
         return cls(np.eye(3), np.zeros(3))
 
+    def forget(self) -> None:
+        """Begin another interval."""
+        self.turn[:] = np.eye(3)
+        self.impulse[:] = 0.0
+
 
 @compiled
 def feel(felt: Felt, motion: Motion) -> None:
@@ -175,8 +178,8 @@ class Order(NamedTuple):
     kind: Ints
     row: Ints
     """Number of the sample, or of the first detection of the frame."""
-    ends_interval: Ints
-    """1 where an interval of gravity ends at an epoch, else 0."""
+    has_more: Ints
+    """1 for an epoch at which the plane, or gravity over an interval that ends there, is measured too, else 0."""
 
 
 class Call(NamedTuple):
@@ -191,6 +194,8 @@ class Call(NamedTuple):
     """Epoch at which the interval of gravity began."""
     interval_ns: int
     """Least length of an interval of gravity; 0: gravity is not used."""
+    has_plane: bool
+    """True where the vehicle stays on a plane."""
 
 
 @compiled
@@ -245,6 +250,7 @@ def in_order(
         if kind == EPOCH:
             epoch += 1
             node_ns = epochs_ns[row]
+            out[5, n] = call.has_plane
             if 0 < call.interval_ns <= node_ns - opened_ns:
                 out[5, n] = 1
                 opened_ns = node_ns
@@ -257,8 +263,55 @@ def in_order(
     return out[:, :n].copy()
 
 
+class Events(NamedTuple):
+    """Events of a call, n of them, the motion to each from its newest epoch, and samples."""
+
+    order: Order
+    motions: Motions
+    is_gap: NDArray[np.bool_]
+    """True where that motion leads over a gap of the Doppler log, shape (n,)."""
+    value: Floats
+    """`Samples.value`."""
+    noise: Floats
+    views: Views
+
+
+class Surroundings(NamedTuple):
+    """What a filter knows beside its state and the events."""
+
+    felt: Felt
+    port_m: Floats
+    """Pressure port in the body, shape (3,)."""
+    earth_rad_s: Floats
+    """The Earth's rate in the world, shape (3,)."""
+    has_rate: bool
+    """True where gyros measure a bias of the state or the Earth's rate."""
+    walk_density: Floats
+    """Of the biases in the state."""
+    sonar: Sonar
+    follows_frames: bool
+    """False where landmarks may be far, or are compared with a map: each frame is then an event of its own."""
+
+
+@inlined
+def is_followed(events: Events, around: Surroundings, k: int, first: int) -> bool:
+    """True for an epoch, a depth or a frame; a motion over a gap depends on the state, and is bridged in its turn."""
+    kind = events.order.kind[k]
+    is_frame = kind == FRAME and around.follows_frames
+    return (kind <= DEPTH or is_frame) and (k == first or not events.is_gap[k])
+
+
+@inlined
+def motion_to(events: Events, k: int) -> Motion:
+    """Motion that leads to an event."""
+    motions = events.motions
+    return Motion(
+        motions.dR[k], motions.dp[k], motions.C[k], motions.D[k], motions.impulse[k]
+    )
+
+
 @compiled
-def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
+def remove_rate(motion: Motion, bias: Vec3, earth_i: Vec3) -> Motion:
     """Motion without a gyro bias and the Earth's rate (frame i, both in rad/s), to first order.
 
     For gyros the Earth's rate is a bias, the mean of its values in frames i and j. The specific force turns by half of
@@ -266,8 +319,7 @@ def remove_rate(motion: Motion, bias: Floats, earth: Floats) -> Motion:
     """
     dR = mat(motion.dR)
     impulse = vec(motion.impulse)
-    earth_i = vec(earth)
-    rate = vec(bias) + 0.5 * (earth_i + dR.T @ earth_i)
+    rate = bias + 0.5 * (earth_i + dR.T @ earth_i)
     theta = mat(motion.D) @ rate
     rho = mat(motion.D, LOWER_LEFT) @ rate
     # C and D stay: they would change in second order

@@ -15,23 +15,25 @@ from pydantic import Field
 from baselines.events import (
     DEPTH,
     END,
-    EPOCH,
     FIX,
     FRAME,
     HEADING,
     LONG_AGO,
+    NO_ROW,
     NOT_STARTED,
+    UNKNOWN,
     Call,
+    Events,
     Felt,
     Motion,
     Order,
     Samples,
-    Sighted,
     Sonar,
+    Surroundings,
     Views,
-    feel,
     in_frame,
     in_order,
+    motion_to,
     read_detections,
     remove_rate,
 )
@@ -65,6 +67,7 @@ from sonar_graph.models import (
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world
+from sonar_graph.numerics import vec
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -87,6 +90,8 @@ NO_SAMPLES = Samples(NO_STAMPS, NO_STAMPS, np.empty((0, 3)), np.empty((0, 3, 3))
 NO_VIEWS = Views(
     stamp_ns=NO_STAMPS,
     ids=NO_STAMPS,
+    slot=NO_STAMPS,
+    gate=np.empty(0),
     z=np.empty((0, 2)),
     R_z=np.empty((0, 2, 2)),
     outcome=np.empty(0, np.int8),
@@ -154,7 +159,6 @@ class FilterShell(ABC):
         self.odometry = odometry
         self.params = params
         self.sonar = sonar_of(calibration, params)
-        self.port = np.array(calibration.depth.port_m)
         self.antenna = np.array(calibration.positions.antenna_m)
         self.compass_variance_rad2 = calibration.heading.bias_sigma_rad**2
         """Of the constant bias of the compass, at the start."""
@@ -166,13 +170,19 @@ class FilterShell(ABC):
             round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
         )
         earth = earth_rate_in_world(calibration)
-        self._earth = np.zeros(3) if earth is None else earth
-        self._has_rate = self.has_bias or earth is not None
+        self.around = Surroundings(
+            felt=Felt.nothing(),
+            port_m=np.array(calibration.depth.port_m),
+            earth_rad_s=np.zeros(3) if earth is None else earth,
+            has_rate=self.has_bias or earth is not None,
+            walk_density=np.zeros(0),
+            sonar=self.sonar,
+            follows_frames=calibration.map is None,
+        )
         self._reached_ns = NOT_STARTED
         self._done_ns = LONG_AGO
         self._opened_ns = 0
         self._opened_velocity = (np.zeros(3), 0.0)
-        self._felt = Felt.nothing()
         self._kept_ns = 0
         self._used_in_gap: dict[tuple[int, int], int] = {}
         self._may_be_far = False
@@ -190,14 +200,19 @@ class FilterShell(ABC):
     # ---------------------------------------------------------------- equations of a filter
 
     @abstractmethod
-    def predict(self, motion: Motion, duration_s: float) -> None:
-        """Carry the state over the motion to the next epoch."""
+    def follow(self, events: Events, first: int) -> int:
+        """Predict to epochs, update by depths and frames, in turn from one event on; the number of the event that is next.
+
+        It stops before an event of another kind, a frame with a new landmark, and after an epoch at which more is
+        measured.
+        """
 
     @abstractmethod
-    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+    def observe(self, motion: Motion, views: Views, first: int) -> int:
         """Update by range and azimuth of known landmarks, one after the other, a motion after the state.
 
-        Writes outcomes and innovations into the views.
+        From one row of a frame on. Writes outcomes and innovations into the views. Returns the row of the next landmark
+        that is not known, `NO_ROW` without any.
         """
 
     @abstractmethod
@@ -209,10 +224,6 @@ class FilterShell(ABC):
     @abstractmethod
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, a motion after the state."""
-
-    @abstractmethod
-    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
-        """Update by the height of the pressure port, a motion after the state."""
 
     @abstractmethod
     def update_heading(
@@ -287,7 +298,12 @@ class FilterShell(ABC):
             )
             if end_ns >= max(self._reached_ns, self.node_ns):
                 call = Call(
-                    since_ns, end_ns, self.node_ns, self._opened_ns, self._interval_ns
+                    since_ns=since_ns,
+                    end_ns=end_ns,
+                    node_ns=self.node_ns,
+                    opened_ns=self._opened_ns,
+                    interval_ns=self._interval_ns,
+                    has_plane=self.calibration.planar is not None,
                 )
                 estimate = self._run(call, samples, views)
                 self._estimates.keep(estimate)
@@ -368,9 +384,12 @@ class FilterShell(ABC):
             detections.range_azimuth_cov,
             self._R_z,
         )
+        wanted = ids.tolist()
+        slot = np.array([self._slots.get(each, UNKNOWN) for each in wanted])
+        gate = np.array([self._gate(each) for each in wanted])
         e = np.full(z.shape, math.nan)
         S = np.full(R_z.shape, math.nan)
-        return Views(stamps_ns, ids, z, R_z, outcome, e, S)
+        return Views(stamps_ns, ids, slot, gate, z, R_z, outcome, e, S)
 
     def _samples(
         self,
@@ -438,7 +457,7 @@ class FilterShell(ABC):
         noise[np.isnan(noise).any(axis=(1, 2))] = np.diag(
             np.square(self.calibration.positions.sigma_m)
         )
-        return _samples(fixes.stamps_ns, FIX, fixes.position_m, noise)
+        return _samples(fixes.stamps_ns, FIX, fixes.position_m.copy(), noise)
 
     def _in_time(
         self, samples: Samples, is_sound: NDArray[np.bool_] | None, since_ns: int
@@ -476,39 +495,26 @@ class FilterShell(ABC):
 
     def _run(self, call: Call, samples: Samples, views: Views) -> Estimate:
         """Carry the state to the newest epoch reached at the end of the call, with all measurements on the way."""
-        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, call.end_ns)
-        order = Order(
-            *in_order(
-                epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call
-            )
-        )
-        motions = self.odometry.motions(
-            order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS
-        )
-        is_gap = np.isnan(motions.dp[:, 0]).tolist()
-        events = zip(
-            order.kind.tolist(),
-            order.row.tolist(),
-            zip(*motions, strict=True),
-            strict=True,
-        )
-        for k, (kind, row, columns) in enumerate(events):
-            # a gap depends on the state's attitude and bias, so it is bridged when its turn comes
-            motion = (
-                self._bridge(order, k, views)
-                if is_gap[k]
-                else self._reduced(Motion(*columns))
-            )
-            if kind == EPOCH:
-                self._to_epoch(
-                    motion, int(order.end_ns[k]), ends_interval=order.ends_interval[k]
-                )
-            elif kind == FRAME:
+        events = self._events(call, samples, views)
+        order = events.order
+        kinds = order.kind.tolist()
+        last = len(kinds) - 1
+        k = 0
+        while k < last:
+            if events.is_gap[k]:
+                self._bridge(events, k, views)
+            kind = kinds[k]
+            after = self.follow(events, k)
+            newest_ns = int(order.start_ns[after])
+            if newest_ns > self.node_ns:
+                self._correct_at(newest_ns)
+            if after > k:
+                k = after
+                continue
+            motion = self._motion_to(events, k)
+            row = int(order.row[k])
+            if kind == FRAME:
                 self._see(motion, views, row)
-            elif kind == DEPTH:
-                self.update_depth(
-                    motion, samples.value[row, 2], samples.noise[row, 2, 2]
-                )
             elif kind == HEADING:
                 distance = self.update_heading(
                     motion, samples.value[row, 0], samples.noise[row, 0, 0]
@@ -519,7 +525,10 @@ class FilterShell(ABC):
                     motion, samples.value[row], samples.noise[row]
                 )
                 self._contradictions.judge("positions", distance)
-        R, X, covariance = self.pose_after(motion)
+            k += 1
+        if events.is_gap[last]:
+            self._bridge(events, last, views)
+        R, X, covariance = self.pose_after(self._motion_to(events, last))
         self.odometry.settle(self.node_ns)
         # rows that late fixes may still need are kept
         if self.node_ns > self._kept_ns + KEPT_NS:
@@ -527,22 +536,35 @@ class FilterShell(ABC):
             self._kept_ns = self.node_ns
         return Estimate(call.end_ns, gtsam.Pose3(gtsam.Rot3(R), X), covariance)
 
-    def _reduced(self, motion: Motion) -> Motion:
-        """The motion without the gyro bias of the state and the Earth's rate."""
-        if not self._has_rate:
-            return motion
-        return remove_rate(motion, self.gyro_bias(), self.attitude().T @ self._earth)
+    def _events(self, call: Call, samples: Samples, views: Views) -> Events:
+        """Events of a call, the last of which is its end."""
+        epochs_ns, reached_ns = self.odometry.epochs_reached(self.node_ns, call.end_ns)
+        order = Order(
+            *in_order(
+                epochs_ns, reached_ns, samples.stamp_ns, samples.kind, views, call
+            )
+        )
+        motions = self.odometry.motions(
+            order.start_ns, order.end_ns, order.stamp_ns, NO_BIAS
+        )
+        is_gap = np.isnan(motions.dp[:, 0])
+        return Events(order, motions, is_gap, samples.value, samples.noise, views)
 
-    def _to_epoch(self, motion: Motion, epoch_ns: int, *, ends_interval: bool) -> None:
-        """Predict to an epoch, and correct there by the plane, and by gravity where an interval of it ends."""
-        self.check(self.node_ns)
-        self.predict(motion, (epoch_ns - self.node_ns) * 1e-9)
+    def _motion_to(self, events: Events, k: int) -> Motion:
+        """Motion to an event without the gyro bias of the state and the Earth's rate."""
+        motion = motion_to(events, k)
+        if events.is_gap[k] or not self.around.has_rate:
+            return motion
+        earth_i = self.attitude().T @ self.around.earth_rad_s
+        return remove_rate(motion, vec(self.gyro_bias()), vec(earth_i))
+
+    def _correct_at(self, epoch_ns: int) -> None:
+        """Correct at a new epoch by the plane, and by gravity where an interval of it ends."""
         self.node_ns = epoch_ns
-        # gravity is compared with the specific force in the frame where its interval began
-        feel(self._felt, motion)
+        self.check(epoch_ns)
         if self.calibration.planar is not None:
             self.update_plane(self.calibration.planar)
-        if ends_interval:
+        if 0 < self._interval_ns <= epoch_ns - self._opened_ns:
             self._level(epoch_ns)
 
     def _level(self, epoch_ns: int) -> None:
@@ -550,7 +572,7 @@ class FilterShell(ABC):
         duration_s = (epoch_ns - self._opened_ns) * 1e-9
         velocity_i, variance_i = self._opened_velocity
         velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
-        turn, impulse = self._felt
+        turn, impulse = self.around.felt
         up = up_direction(
             impulse / duration_s, turn, velocity_i, velocity_j, duration_s
         )
@@ -563,54 +585,43 @@ class FilterShell(ABC):
             self.update_up(up, sigma_rad, turn)
         self._opened_ns = epoch_ns
         self._opened_velocity = (velocity_j, variance_j)
-        self._felt = Felt.nothing()
+        self.around.felt.forget()
 
     def _see(self, motion: Motion, views: Views, first: int) -> None:
         """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
-        known: list[int] = []
-        for row in in_frame(views, first).tolist():
-            landmark_id = int(views.ids[row])
-            if landmark_id in self._slots:
-                known.append(row)
-                continue
-            # seen for the first time: the rows before it count first
-            self._observe(motion, views, known)
-            known = []
-            self.augment(motion, views.z[row], views.R_z[row])
-            self._slots[landmark_id] = self._landmarks
-            self._landmarks += 1
-            views.outcome[row] = NEW
-        self._observe(motion, views, known)
-
-    def _observe(self, motion: Motion, views: Views, rows: list[int]) -> None:
-        """Update by known landmarks, which the rows of a frame show."""
+        rows = in_frame(views, first).tolist()
         if self._may_be_far:
-            rows = [row for row in rows if not self._observe_far(motion, views, row)]
-        if not rows:
-            return
-        ids = views.ids[rows].tolist()
-        sighted = Sighted(
-            rows=np.array(rows),
-            slots=np.array([self._slots[landmark_id] for landmark_id in ids]),
-            gates=np.array([self._gate(landmark_id) for landmark_id in ids]),
-        )
-        self.observe(motion, views, sighted)
+            for row in rows:
+                self._observe_far(motion, views, row)
+        new = self.observe(motion, views, first)
+        while new != NO_ROW:
+            self.augment(motion, views.z[new], views.R_z[new])
+            self._place(views, int(views.ids[new]), self._landmarks)
+            self._landmarks += 1
+            views.outcome[new] = NEW
+            new = self.observe(motion, views, new)
         # only landmarks of the map are compared with it
         if self._known.held:
             for row in rows:
                 self._judge_map(views, row)
 
-    def _observe_far(self, motion: Motion, views: Views, row: int) -> bool:
-        """Update by the point seen in a row; False where that is not needed."""
-        landmark_id = int(views.ids[row])
-        judged = self.observe_far(
-            motion, self._slots[landmark_id], views.z[row], views.R_z[row]
-        )
-        if judged is None:
-            return False
-        views.outcome[row], views.e[row], views.S[row] = judged
-        self._judge_map(views, row)
-        return True
+    def _place(self, views: Views, landmark_id: int, slot: int) -> None:
+        """Give a landmark a number in the state; `UNKNOWN` takes it away."""
+        views.slot[views.ids == landmark_id] = slot
+        if slot == UNKNOWN:
+            views.gate[views.ids == landmark_id] = self.sonar.gate
+            del self._slots[landmark_id]
+        else:
+            self._slots[landmark_id] = slot
+
+    def _observe_far(self, motion: Motion, views: Views, row: int) -> None:
+        """Update by the point seen in a row where its landmark is known and far."""
+        slot = int(views.slot[row])
+        if slot == UNKNOWN:
+            return
+        judged = self.observe_far(motion, slot, views.z[row], views.R_z[row])
+        if judged is not None:
+            views.outcome[row], views.e[row], views.S[row] = judged
 
     def _gate(self, landmark_id: int) -> float:
         """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map."""
@@ -628,10 +639,10 @@ class FilterShell(ABC):
             landmark_id, stamp_ns, views.e[row].copy(), views.S[row]
         )
         if verdict is Verdict.RELEASE:
-            del self._slots[landmark_id]
+            self._place(views, landmark_id, UNKNOWN)
 
-    def _bridge(self, order: Order, k: int, views: Views) -> Motion:
-        """Motion over a gap, with the share of its error that the measurements of one more event may have.
+    def _bridge(self, events: Events, k: int, views: Views) -> None:
+        """Write the motion over a gap, with the share of its error that the measurements of one more event may have.
 
         Measurements that are related to one epoch over the same gap of the Doppler log share its error. The k-th gets
         ``k (k + 1)`` times the motion's covariance: together those of one kind, such as depths or detections, inform no
@@ -639,6 +650,7 @@ class FilterShell(ABC):
 
         In a state without bias an unknown one, which tilts gravity, adds to the covariance of the displacement.
         """
+        order = events.order
         kind = int(order.kind[k])
         end_ns = int(order.end_ns[k])
         over = self.odometry.motion(
@@ -656,7 +668,11 @@ class FilterShell(ABC):
         more = len(in_frame(views, int(order.row[k]))) if kind == FRAME else 1
         if kind != END:  # an estimate alone changes nothing
             self._may_be_far = self.params.far_views
-        return self._shared(motion, kind, more)
+            if self._may_be_far:
+                self.around = self.around._replace(follows_frames=False)
+        shared = self._shared(motion, kind, more)
+        for columns, values in zip(events.motions, shared, strict=True):
+            columns[k] = values
 
     def _shared(self, motion: Motion, kind: int, more: int = 1) -> Motion:
         """Motion into the gap after the newest epoch with the share of its error that some more measurements have."""

@@ -47,7 +47,23 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from baselines.events import Motion, Sighted, Sonar, Views, elevation_of_new
+from baselines.events import (
+    DEPTH,
+    EPOCH,
+    NO_ROW,
+    UNKNOWN,
+    Events,
+    Motion,
+    Sonar,
+    Surroundings,
+    Views,
+    elevation_of_new,
+    feel,
+    in_frame,
+    is_followed,
+    motion_to,
+    remove_rate,
+)
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
@@ -113,7 +129,6 @@ POINT = 3
 """Length of one xi_k."""
 BETA_ACCEL = slice(3 + ACCEL.start, 3 + ACCEL.stop)
 BETA_COMPASS = 3 + COMPASS
-NO_UP = np.zeros(3)
 
 
 class InvariantState(NamedTuple):
@@ -233,13 +248,17 @@ def store_by_biases(h_b: Vec6, D: Floats, H: Floats, row: int) -> None:
 
 @compiled
 def observe(
-    state: InvariantState, motion: Motion, sonar: Sonar, views: Views, sighted: Sighted
-) -> None:
-    """Update by range and azimuth of known landmarks, (5), in turn; writes outcome, innovation and covariance of each."""
+    state: InvariantState, motion: Motion, sonar: Sonar, views: Views, first: int
+) -> int:
+    """Update by range and azimuth of known landmarks, (5), in turn; writes outcome, innovation and covariance of each.
+
+    From one row of a frame on; returns the row of the next landmark that is not known, `NO_ROW` without any.
+    """
     mount = Mount(sonar.body_R_sonar, sonar.body_p_sonar)
-    for m in range(len(sighted.rows)):
-        row = sighted.rows[m]
-        k = 1 + sighted.slots[m]
+    for row in in_frame(views, first):
+        if views.slot[row] == UNKNOWN:
+            return row
+        k = 1 + views.slot[row]
         at = BODY.start + POINT * k
         z = views.z[row]
         R_z = views.R_z[row]
@@ -257,10 +276,11 @@ def observe(
         noise = view_noise(sight, motion, R_z)
         HP, S = innovation_of(state.P, H, noise)  # (9)
         # the kernel widens the noise of the detection, not that of the motion
-        outcome, widened = judged(e, S, R_z, sighted.gates[m], sonar.kernel_width)
+        outcome, widened = judged(e, S, R_z, views.gate[row], sonar.kernel_width)
         if outcome != GATED:
             move(state, correction(state.P, HP, S + widened, e))
         write_judged(views, row, outcome, e, S)
+    return NO_ROW
 
 
 @compiled
@@ -278,6 +298,42 @@ def update_depth(
     store_by_biases(h_b, D, H, 0)
     e = np.array([z_m - a.z])
     update(state, H, e, np.array([[h_b @ (mat6(motion.C) @ h_b) + variance_m2]]))
+
+
+@compiled
+def follow(
+    state: InvariantState, events: Events, around: Surroundings, first: int
+) -> int:
+    """Predict to epochs, update by depths and frames, in turn from one event on; the number of the event that is next.
+
+    It stops before a frame with a new landmark, and after an epoch at which more is measured.
+    """
+    order = events.order
+    k = first
+    while is_followed(events, around, k, first):
+        motion = motion_to(events, k)
+        # a motion over a gap has been reduced
+        if around.has_rate and not events.is_gap[k]:
+            R = mat(state.R)
+            up = R.z if state.is_level else ZERO
+            bias = gyro_bias_of(state.bias, up)
+            motion = remove_rate(motion, bias, R.T @ vec(around.earth_rad_s))
+        row = order.row[k]
+        if order.kind[k] == EPOCH:
+            duration_s = (order.end_ns[k] - order.start_ns[k]) * 1e-9
+            predict(state, motion, around.walk_density**2 * duration_s)
+            # gravity is compared with the specific force in the frame where its interval began
+            feel(around.felt, motion)
+            if order.has_more[k]:
+                return k + 1
+        elif order.kind[k] == DEPTH:
+            z_m = events.value[row, 2]
+            variance_m2 = events.noise[row, 2, 2]
+            update_depth(state, motion, around.port_m, z_m, variance_m2)
+        elif observe(state, motion, around.sonar, events.views, row) != NO_ROW:
+            return k
+        k += 1
+    return k
 
 
 class InvariantEkfParams(FilterParams):
@@ -325,7 +381,7 @@ class InvariantEkf(FilterShell):
         params: InvariantEkfParams | None = None,
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
-        self._walk_density = bias_sigmas(calibration)[1]
+        self.around = self.around._replace(walk_density=bias_sigmas(calibration)[1])
         self._state = with_map(start_state(calibration), self._known)
 
     def state(self) -> tuple[int, InvariantState]:
@@ -337,13 +393,13 @@ class InvariantEkf(FilterShell):
             P=self._state.P.copy(),
         )
 
-    def predict(self, motion: Motion, duration_s: float) -> None:
-        """Carry the state over the motion to the next epoch, (2) and (3)."""
-        predict(self._state, motion, self._walk_density**2 * duration_s)
+    def follow(self, events: Events, first: int) -> int:
+        """Predict to epochs, update by depths and frames, in turn; the number of the event that is next."""
+        return follow(self._state, events, self.around, first)
 
-    def observe(self, motion: Motion, views: Views, sighted: Sighted) -> None:
+    def observe(self, motion: Motion, views: Views, first: int) -> int:
         """Update by range and azimuth of known landmarks, (5)."""
-        observe(self._state, motion, self.sonar, views, sighted)
+        return observe(self._state, motion, self.sonar, views, first)
 
     def observe_far(
         self, motion: Motion, slot: int, z: Floats, R_z: Floats
@@ -393,10 +449,6 @@ class InvariantEkf(FilterShell):
                 sonar.floor_z_m - g[2:],
                 np.array([[sonar.floor_variance_m2]]),
             )
-
-    def update_depth(self, motion: Motion, z_m: float, variance_m2: float) -> None:
-        """Update by the height of the pressure port, (7)."""
-        update_depth(self._state, motion, self.port, z_m, variance_m2)
 
     def update_heading(
         self, motion: Motion, yaw_rad: float, variance_rad2: float
@@ -479,9 +531,8 @@ class InvariantEkf(FilterShell):
 
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s."""
-        return gyro_bias_of(
-            self._state.bias, self._state.R[2] if self._state.is_level else NO_UP
-        )
+        up = vec(self._state.R[2]) if self._state.is_level else ZERO
+        return np.array(gyro_bias_of(self._state.bias, up))
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state.

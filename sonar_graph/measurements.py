@@ -6,6 +6,7 @@ Python call for every IMU sample. `Measurements` bundles what arrived since the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -61,6 +62,18 @@ def no_posterior(probability: Floats) -> NDArray[np.bool_]:
 def possible_ranges(range_m: Floats) -> NDArray[np.bool_]:
     """Mask of ranges above 0 and at most `FARTHEST_M`, shape (n,)."""
     return np.asarray((range_m > 0) & (range_m <= FARTHEST_M))
+
+
+def _is_sound(a: float, b: float, c: float, d: float) -> bool:
+    """True for a covariance [[a, b], [c, d]] that is positive definite, or not known (NaN)."""
+    if any(math.isnan(number) for number in (a, b, c, d)):
+        return True
+    if not (a > 0 and d > 0):
+        return False
+    # determinant and symmetry relative to the diagonal: metres and radians differ
+    variances = a * d
+    is_definite = variances - b * c > ROUNDING * variances
+    return is_definite and abs(b - c) <= ROUNDING * math.sqrt(variances)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -435,19 +448,12 @@ class LandmarkDetections(Block):
 
     def are_sound(self) -> NDArray[np.bool_]:
         """Mask, shape (n,), of rows with possible range and azimuth, and a positive definite or no covariance (NaN)."""
-        # determinant and symmetry relative to the diagonal: metres and radians differ
-        a, b, c, d = self.range_azimuth_cov.reshape(-1, 4).T
-        with np.errstate(all="ignore"):
-            ad = a * d
-            is_sound = (
-                (a > 0)
-                & (ad - b * c > ROUNDING * ad)
-                & (np.abs(b - c) <= ROUNDING * np.sqrt(ad))
-            )
-        if not is_sound.all():
-            is_sound |= np.isnan(self.range_azimuth_cov).any(axis=(1, 2))
+        covariances = self.range_azimuth_cov.reshape(-1, 4).tolist()
+        # a frame has few rows: a loop over numbers is faster than operations on arrays
+        is_sound = np.array([_is_sound(*cov) for cov in covariances])
         is_sound &= possible_ranges(self.range_m)
-        return is_sound & (np.abs(self.azimuth_rad) <= FULL_TURN_RAD)
+        is_sound &= np.abs(self.azimuth_rad) <= FULL_TURN_RAD
+        return is_sound
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""

@@ -28,6 +28,7 @@ from sonar_graph.models import (
     gyro_bias_of,
 )
 from sonar_graph.navigation import Odometry
+from sonar_graph.numerics import Vec3
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
 
@@ -113,7 +114,7 @@ def test_both_gyro_biases_add_up_and_one_is_about_the_vertical():
     np.testing.assert_allclose(up_j @ D[:3, TILT], 0.0, atol=1e-12)
     assert np.abs(D[:3, HEADING]).max() > 3.0
     b = np.arange(11.0)
-    assert gyro_bias_of(b, np.array([0.0, 0.0, 1.0])) == pytest.approx([0.0, 1.0, 5.0])
+    assert gyro_bias_of(b, Vec3(0.0, 0.0, 1.0)) == pytest.approx([0.0, 1.0, 5.0])
 
 
 def test_the_scale_lengthens_the_way_of_the_doppler_log():

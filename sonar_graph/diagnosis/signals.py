@@ -370,9 +370,10 @@ def steps(
     of its own typical size, and beyond `LEAST_STEP` of ``sigma``, that of a row; so is that of three times as many. A
     vehicle that stops and goes shows a wrong scale in steps: those of x must be smaller by a ``ratio``.
     """
-    known = np.isfinite(y - x).reshape(len(x), -1).all(axis=1)
+    beyond = as_columns(y - x)
+    known = np.isfinite(beyond).all(axis=1)
     t = seconds[known]
-    excess = as_columns(y - x)[known]
+    excess = beyond[known]
     near = median_changes(excess, STEP_ROWS)
     wide = median_changes(excess, 3 * STEP_ROWS)
     size = np.minimum(near, wide)

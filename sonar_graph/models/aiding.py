@@ -233,9 +233,12 @@ def bias_sigmas(calibration: Calibration) -> tuple[Floats, Floats]:
     return sigmas, np.where(sigmas > 0, walks, 0.0)
 
 
-def gyro_bias_of(b: Floats, up: Floats) -> Floats:
-    """Gyro bias in body axes, shape (3,), where the world's up lies along ``up`` in the body; zero without gravity."""
-    return b[TILT] + up * (up @ (b[HEADING] - b[TILT]))
+@inlined
+def gyro_bias_of(b: Floats, up: Vec3) -> Vec3:
+    """Gyro bias in body axes, where the world's up lies along ``up`` in the body; zero without gravity."""
+    tilt = vec(b)
+    heading = vec(b[HEADING])
+    return tilt + (up @ (heading - tilt)) * up
 
 
 @compiled

@@ -502,7 +502,8 @@ class Keyframes:
         biases = self.bias(i)
         attitude = self.smoother.estimates.atPose3(X(i)).rotation().matrix()
         up = attitude[2] if self.calibration.use_gravity else np.zeros(3)
-        return Linearisation(biases, attitude, up, gyro_bias_of(biases, up))
+        gyro_bias = np.array(gyro_bias_of(biases, vec(up)))
+        return Linearisation(biases, attitude, up, gyro_bias)
 
     def _linearise(self) -> None:
         """Fix biases and attitude for the motions from a new keyframe at their estimates when it is set.

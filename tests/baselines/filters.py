@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from baselines.ekf_slam import EkfSlam
-from baselines.events import Motion, Sighted, Views
-from baselines.filter import FilterShell
+from baselines.events import DEPTH, EPOCH, Events, Motion, Order, Views
+from baselines.filter import NO_VIEWS, FilterShell
 from baselines.invariant_ekf import InvariantEkf, InvariantState
 from sonar_graph.calibration import (
     Calibration,
@@ -21,6 +21,8 @@ from sonar_graph.calibration import (
     SonarCalibration,
 )
 from sonar_graph.measurements import Floats
+from sonar_graph.models import ACCEPTED
+from sonar_graph.motion import Motions
 from sonar_graph.navigation import Odometry
 
 SONAR = Mounting(translation_m=(0.4, 0.1, -0.2), rpy_rad=(0.1, 0.5, -0.2))
@@ -265,12 +267,44 @@ def observe_one(
     views = Views(
         stamp_ns=first,
         ids=first,
+        slot=np.array([slot]),
+        gate=np.array([slam.sonar.gate]),
         z=z[None],
         R_z=R_z[None],
-        outcome=np.zeros(1, np.int8),
+        outcome=np.full(1, ACCEPTED, np.int8),
         e=np.zeros((1, 2)),
         S=np.zeros((1, 2, 2)),
     )
-    sighted = Sighted(first, np.array([slot]), np.array([slam.sonar.gate]))
-    slam.observe(motion, views, sighted)
+    slam.observe(motion, views, 0)
     return int(views.outcome[0]), views.e[0], views.S[0]
+
+
+def follow_one(
+    slam: FilterShell, kind: int, motion: Motion, end_ns: int, *depth: float
+) -> None:
+    """Let one epoch or depth (height, variance) happen; the motion to it has no gyro bias any more, as over a gap."""
+    instants = [
+        np.array([number], np.int64) for number in (end_ns, 0, end_ns, kind, 0, 0)
+    ]
+    motions = Motions(*(np.array([column]) for column in motion))
+    value = np.zeros((1, 3))
+    noise = np.zeros((1, 3, 3))
+    if depth:
+        value[0, 2], noise[0, 2, 2] = depth
+    is_reduced = np.array([True])
+    # what follows an event ends the run of events
+    order = Order(*(np.append(column, 5) for column in instants))
+    is_gap = np.append(is_reduced, True)
+    slam.follow(Events(order, motions, is_gap, value, noise, NO_VIEWS), 0)
+
+
+def predict(slam: FilterShell, motion: Motion, duration_s: float = 0.0) -> None:
+    """Carry the state over a motion."""
+    follow_one(slam, EPOCH, motion, round(duration_s * 1e9))
+
+
+def update_depth(
+    slam: FilterShell, motion: Motion, z_m: float, variance_m2: float
+) -> None:
+    """Update by a depth, a motion after the state."""
+    follow_one(slam, DEPTH, motion, 0, z_m, variance_m2)

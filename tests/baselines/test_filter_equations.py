@@ -31,11 +31,13 @@ from .filters import (
     motion_of,
     observe_one,
     pose_after,
+    predict,
     random_covariance,
     rotation,
     sonar_after,
     triples,
     twists,
+    update_depth,
     views,
     world_at,
 )
@@ -91,7 +93,7 @@ def test_prediction_has_the_numerical_covariance_of_state_and_motion(
         world,
     )
     _, P = filter_.estimate(slam)
-    slam.predict(motion, 0.0)
+    predict(slam, motion)
     after, covariance = filter_.estimate(slam)
     assert_allclose(filter_.error(after, expected), 0.0, atol=1e-12)
     assert_covariance(covariance, F @ P @ F.T + J @ C @ J.T)
@@ -161,7 +163,7 @@ def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(
     slam = begun(filter_, world)
     height = lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT)[2:]  # noqa: E731
     H, H_m = numerical(height, filter_, world)
-    slam.update_depth(motion, height(world, NOTHING)[0] + 0.02, 3e-4)
+    update_depth(slam, motion, height(world, NOTHING)[0] + 0.02, 3e-4)
     assert_corrected(
         filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02])
     )
@@ -267,7 +269,7 @@ def test_depth_up_and_plane_are_scalar_kalman_updates(filter_):
         return gtsam.Rot3(R).rpy(), X, np.diag(cov)
 
     noisy = still._replace(C=0.02 * np.eye(6))
-    _, X, variances = after(lambda slam: slam.update_depth(noisy, 0.01, 0.03))
+    _, X, variances = after(lambda slam: update_depth(slam, noisy, 0.01, 0.03))
     assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
     assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
@@ -388,7 +390,7 @@ def test_the_bias_walks_where_there_is_one():
         + [CALIBRATION.imu.accel_bias_walk_density] * 3
         + [0.0] * 2
     )
-    slam.predict(motion._replace(D=np.zeros((6, 3))), duration_s)
+    predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
     walked = np.diag(
         [0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9
     )
@@ -414,15 +416,15 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(
     known = gauge(2) @ gauge(2).T
     slam = begun(Invariant, world, known, gate=1.0)
     observe_one(slam, motion, 1, view[:2] + 0.1, NOISE)
-    slam.update_depth(motion, 0.3, 1e-2)
+    update_depth(slam, motion, 0.3, 1e-2)
     slam.update_up(np.array([0.1, 0.2, 0.9]), 0.1, np.eye(3))
     slam.update_plane(PlanarMotion())
     assert_allclose(slam.state()[1].P, known, atol=1e-10)
-    slam.predict(motion, 0.0)
+    predict(slam, motion)
     assert_allclose(slam.state()[1].P, known, atol=1e-10)
     known = gauge(3) @ gauge(3).T
     slam = begun(Invariant, world, known)
-    slam.update_depth(motion, 0.3, 1e-2)
+    update_depth(slam, motion, 0.3, 1e-2)
     assert np.abs(slam.state()[1].P - known).max() > 0.5
 
 

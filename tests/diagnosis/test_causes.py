@@ -210,17 +210,20 @@ def test_a_scale_of_the_heading_is_told_from_one_of_the_gyros_by_the_fixes(wrong
     assert not [f.quantity for f in acting if f.quantity.startswith("position fixes")]
 
 
-@pytest.mark.parametrize("is_felt", [True, False])
+@pytest.mark.parametrize("felt", ["always", "but for a hole", "but for two"])
 def test_velocities_that_change_where_no_force_was_measured_have_lost_nothing(
-    is_felt: bool,
+    felt: str,
 ):
-    """The vehicle speeds up in 4 s of which the accelerometers have the first and the last sample alone."""
+    """The vehicle speeds up in 4 s. Between two holes of the accelerometers no velocity is measured."""
     run = observed()
     t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
     push = 0.3 * ((t > 30.0) & (t < 34.0))
     force = run.imu.specific_force + push[:, None] * [1.0, 0.0, 0.0]
-    if not is_felt:
+    if felt != "always":
         force[(t > 29.0) & (t < 35.0)] = np.nan
+    if felt == "but for two":
+        between = np.searchsorted(t, 32.05)
+        force[between] = run.imu.specific_force[between]
     of_dvl = (run.dvl.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
     faster = 0.3 * np.clip(of_dvl - 30.0, 0.0, 4.0)
     velocity = run.dvl.velocity + faster[:, None] * [1.0, 0.0, 0.0]
