@@ -66,14 +66,12 @@ def possible_ranges(range_m: Floats) -> NDArray[np.bool_]:
 
 def _is_sound(a: float, b: float, c: float, d: float) -> bool:
     """True for a covariance [[a, b], [c, d]] that is positive definite, or not known (NaN)."""
-    if any(math.isnan(number) for number in (a, b, c, d)):
-        return True
-    if not (a > 0 and d > 0):
-        return False
     # determinant and symmetry relative to the diagonal: metres and radians differ
     variances = a * d
-    is_definite = variances - b * c > ROUNDING * variances
-    return is_definite and abs(b - c) <= ROUNDING * math.sqrt(variances)
+    if a > 0 and d > 0 and variances - b * c > ROUNDING * variances:
+        return abs(b - c) <= ROUNDING * math.sqrt(variances)
+    # NaN compares false
+    return any(math.isnan(number) for number in (a, b, c, d))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

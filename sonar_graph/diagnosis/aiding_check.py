@@ -725,6 +725,8 @@ def heading_drift(drift: Estimate1D, turned_rad: float) -> Finding:
     )
 
 
+HIGHEST_M = 1.0
+"""Height above the surface that waves and the weather give a pressure sensor there."""
 FARTHEST_FROM_START_M = 0.5
 """Difference between the height of a start and that of the first depths that waves and a rough start make."""
 FIRST_ROWS = 5
@@ -776,14 +778,19 @@ def origin_line(config: LogConfig, off_m: ArrayLike, digits: int) -> str:
 
 
 def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
-    """A stated start that is at another height than the first depths; nothing where they agree."""
+    """First depths at another height than a stated start, or above z = 0 where none is stated; nothing where they fit."""
     depth = sequence.depth
-    start = sequence.calibration.start
-    if depth is None or not start.states("position_m"):
+    if depth is None:
         return
+    start = sequence.calibration.start
     first = max(int(np.searchsorted(depth.stamps_ns, sequence.start_ns)) - 1, 0)
     rows_m = depth.z_m[first : first + FIRST_ROWS]
     height_m = float(np.median(rows_m))
+    if not start.states("position_m"):
+        # a map has heights of its own
+        if height_m > HIGHEST_M and sequence.calibration.map is None:
+            yield above_water(height_m, sequence.calibration.depth.sigma_m)
+        return
     port = np.array(sequence.calibration.depth.port_m)
     off_m = height_m - float(start.pose().transformFrom(port)[2])
     sigma_m = float(
@@ -807,6 +814,20 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
         f"`start.position_m = {numbers((x, y, z + off_m), 2)}` {IN_CALIBRATION} where the depths are right",
         estimate=Estimate1D(off_m, sequence.calibration.depth.sigma_m),
         unit="m",
+    )
+
+
+def above_water(height_m: float, sigma_m: float) -> Finding:
+    """Depths above z = 0, on a log whose owner states no start."""
+    return Finding(
+        "depth: height above z = 0",
+        Estimate1D(height_m, sigma_m),
+        "m",
+        "the vehicle would begin above the water: an altimeter, depths positive downwards, or a world whose z = 0 lies "
+        "below the surface?",
+        line=f"{unused('depth')} leaves an altimeter out, scale = -1 there is for depths downwards; where the heights are "
+        f"right, state the start: `start.position_m = {numbers((0.0, 0.0, height_m), 2)}` {IN_CALIBRATION}",
+        gravity=Gravity.ACT,
     )
 
 

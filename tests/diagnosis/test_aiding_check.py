@@ -287,9 +287,11 @@ def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(
         (3.0, -3.0, True),
         (-3000.0, -3.0, True),
         (-50.0, None, False),
+        (0.5, None, False),
+        (7.7, None, True),
     ],
 )
-def test_heights_that_do_not_begin_at_the_stated_start_are_grave(
+def test_heights_that_do_not_begin_at_the_stated_start_or_under_water_are_told(
     z_m: float, stated: float | None, is_told: bool
 ):
     start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
@@ -301,10 +303,11 @@ def test_heights_that_do_not_begin_at_the_stated_start_are_grave(
             replace(RIGHT, depth=depth, calibration=calibration)
         )
     )
-    assert [finding.grave for finding in found] == [True] * is_told
-    assert all(
-        f"the height begins at {z_m:.2f} m" in finding.advice for finding in found
-    )
+    assert [finding.acts for finding in found] == [True] * is_told
+    # a height that nothing contradicts may be one over the bottom
+    assert [finding.grave for finding in found] == [stated is not None] * is_told
+    told = "above the water" if stated is None else f"height begins at {z_m:.2f} m"
+    assert all(told in finding.advice for finding in found)
 
 
 def at_no_stated_start(run: Sequence, source: str) -> Sequence:
