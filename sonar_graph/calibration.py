@@ -395,6 +395,8 @@ class KnownMap(Section):
     """True: estimators count the map's covariance, and report its landmarks as they were given."""
     source: str = ""
     """Origin of the map: a survey, or log and estimator of an earlier run."""
+    moved: tuple[int, ...] = ()
+    """Landmarks that are left out because they have moved: estimators name them, and map them again."""
 
     @field_validator("ids", mode="before")
     @classmethod
@@ -417,6 +419,10 @@ class KnownMap(Section):
         twice = [i for i, count in Counter(self.ids).items() if count > 1]
         if twice:
             raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
+        both = sorted({*self.moved}.intersection(self.ids))
+        if both:
+            reason = f"landmark {both[0]} has a place too; leave its row out"
+            raise misfits(type(self), {"moved": reason})
         if len(self.positions_m) != len(self.ids):
             reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
             raise misfits(type(self), {"positions_m": reason})
@@ -440,7 +446,7 @@ class KnownMap(Section):
         return np.array(self.covariance_m2, dtype=np.float64)
 
     def without(self, ids: Collection[int]) -> Self:
-        """The map without some landmarks; at least one stays."""
+        """The map without some landmarks, which have moved; at least one stays."""
         rows = [
             row for row, landmark_id in enumerate(self.ids) if landmark_id not in ids
         ]
@@ -450,6 +456,7 @@ class KnownMap(Section):
             "ids": tuple(self.ids[row] for row in rows),
             "positions_m": tuple(self.positions_m[row] for row in rows),
             "covariance_m2": tuple(map(tuple, P.tolist())),
+            "moved": (*self.moved, *ids),
         }
         return self.model_copy(update=kept)
 

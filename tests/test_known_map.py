@@ -676,7 +676,7 @@ def test_the_page_of_a_located_dive_shows_the_map(dive):
     assert rows[0][0] == "3"
     assert all(cell.endswith("moved") for cell in rows[0][3:])
     assert [row[0] for row in rows if row[3:] == ["not seen"] * 2] == ["99"]
-    assert located_line(compared).startswith("Located in the map (star): isam2: after ")
+    assert located_line(compared).startswith("Located in the map: isam2: after ")
     smoothed = compared.runs[0].smoothed
     assert len(smoothed) > len(compared.runs[0].causal)
     truth = dive.true_poses.at(smoothed.stamps_ns[:5])
@@ -686,6 +686,16 @@ def test_the_page_of_a_located_dive_shows_the_map(dive):
     assert 'id="show-raw" checked' in page
     assert "map that was given" in page
     assert "start heading" not in compared.sequence.notes.get("log.sensors", "")
+
+
+def test_the_page_calls_places_that_no_sighting_confirms_refused(dive):
+    """In the map of another place the landmarks stay where they were given, which says nothing about them."""
+    known = surveyed(dive)
+    elsewhere = displaced(known, [*known.ids], (30.0, 0.0))
+    table = given_map_table(compare(with_map(dive, elsewhere), ["ekf-slam"]))
+    cells = {row[-1].text for row in table.rows}
+    assert "refused" in cells
+    assert cells <= {"refused", "not seen"}
 
 
 def test_the_truth_is_not_moved_to_estimates_that_a_map_has_placed(dive):

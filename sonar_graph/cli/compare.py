@@ -423,7 +423,8 @@ def print_outcome(comparison: Comparison, place: str) -> None:
         raise typer.Exit(1)
     if doubtful_lines(comparison):
         echo(
-            "sonar-graph: the results are doubtful: see the first lines above", err=True
+            "sonar-graph: the results are doubtful, for the reasons that begin with Doubtful",
+            err=True,
         )
         # a script must not take doubtful numbers for results
         raise typer.Exit(DOUBTFUL)

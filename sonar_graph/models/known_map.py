@@ -24,6 +24,7 @@ CONTRADICTS = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
 FEWEST = 3
 """Number of contradictions in a row from which on a landmark may have moved."""
+MOVED = "moved since the map was made"
 SURE_TIMES = 3
 """Times as many landmarks contradict the map as agree with it, from which on it, or the start, is wrong beyond doubt."""
 SOON_NS = 5_000_000_000
@@ -47,8 +48,8 @@ class KnownLandmarks:
         self.held: set[int] = set(known.ids) if known else set()
         """Identities that still stand where the map has them."""
         self.ids = known.ids if known else ()
-        self.moved: list[int] = []
-        """Identities that do not, in the order in which this was noticed."""
+        self.moved: list[int] = [*known.moved] if known else []
+        """Identities that do not, in the order in which this was noticed; first those that the map leaves out."""
         self.seen: set[int] = set()
         """Identities with a sighting."""
         self._agreeing: Counter[int] = Counter()
@@ -158,8 +159,17 @@ class KnownLandmarks:
         if self._is_outvoted(contradicted):
             moved = [*moved, *contradicted]
             contradicted = []
-        if moved:
-            lines.append(moved_line(moved, is_mapped_again=self._may_release))
+        again = [i for i in moved if self._may_release or i in self.map.moved]
+        if again:
+            lines.append(
+                f"{MOVED}: {named(again)}: mapped again; correct the map, or its sigmas where they are too small"
+            )
+        refused = sorted({*moved}.difference(again))
+        if refused:
+            lines.append(
+                f"{MOVED}: {named(refused)}: their sightings are refused; correct the map, or give history.policy = "
+                "whole to map them again"
+            )
         if contradicted:
             agreeing = (self.held & self.seen).difference(contradicted, moved)
             # a few may agree by chance
@@ -173,16 +183,6 @@ class KnownLandmarks:
         if unseen:
             lines.append(f"of the map not seen: {named(unseen)}")
         return lines
-
-
-def moved_line(ids: Collection[int], *, is_mapped_again: bool) -> str:
-    """Message about landmarks that have moved."""
-    treated = (
-        "mapped again; correct the map, or its sigmas where they are too small"
-        if is_mapped_again
-        else "their sightings are refused; correct the map, or give history.policy = whole to map them again"
-    )
-    return f"moved since the map was made: {named(ids)}: {treated}"
 
 
 def named(ids: Collection[int]) -> str:

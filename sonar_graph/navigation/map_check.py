@@ -3,7 +3,7 @@
 Where the sightings give no start in the map (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
 that then gives a start, with three or more landmarks, is named. A wrong sign of the heights may leave the start where it
 is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, for which one
-landmark is enough, or where the evidence (2) of the best start is `ODDS` times as large with it. Two exchanged identities
+landmark is enough, or where the evidence (2) of the best start is `CLEAR` times as large with it. Two exchanged identities
 are named by the evidence of the map with that exchange undone: a priori each of the n (n - 1) / 2 exchanges is equally
 probable.
 """
@@ -29,6 +29,8 @@ from sonar_graph.navigation.map_start import (
 )
 from sonar_graph.sequence import Sequence
 
+CLEAR = 10.0 * ODDS
+"""Ratio of evidences from which on a mistake is named: a map with one is a tenth as probable a priori."""
 LONGEST_S = 300.0
 """Time after the start within which sightings count: later the odometry has drifted. It counts all the same as long as
 fewer than `ENOUGH` landmarks, or not all of a small map, were seen."""
@@ -91,11 +93,11 @@ def map_fit(sequence: Sequence) -> MapFit:
     if not (is_checked or is_hidden):
         return MapFit(start, is_checked=False)
     gain = 0.0 if start is None else evidence(negated) - evidence(given)
-    if is_hidden or gain > math.log(ODDS):
+    if is_hidden or gain > math.log(CLEAR):
         T = MISTAKES[NORTH_EAST_DOWN]
         # the same heights, and x and y exchanged: the other landmarks decide
         exchanged = followed(sequence, undone(known, T))
-        if evidence(exchanged) - evidence(negated) > math.log(ODDS):
+        if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
     swaps = exchanged_identities(given.sightings, known)
@@ -174,10 +176,10 @@ def exchanged_identities(
         return []
     best = max(log_evidence for log_evidence, _ in found)
     before = starts[0].log_evidence if starts else -math.inf
-    if best - before <= math.log(ODDS * len(pairs)):
+    if best - before <= math.log(CLEAR * len(pairs)):
         return []
     ids = known.ids
-    return [(ids[a], ids[b]) for fit, (a, b) in found if best - fit < math.log(ODDS)]
+    return [(ids[a], ids[b]) for fit, (a, b) in found if best - fit < math.log(CLEAR)]
 
 
 def of_swaps(swaps: list[tuple[int, int]]) -> tuple[str, str]:

@@ -11,12 +11,15 @@ squares over the landmarks that agree with it. A landmark agrees where most of i
 of (1). One with a wrong identity lies anywhere in the area A of the map. The evidence of a start h, with the prior of a
 pose uniform over A and all headings, and its posterior covariance Sigma::
 
-    E(h) = N(e) prod_agreeing (1 - w) prod_others (w / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
-    E(one) = n (1 - w) / A (w / A)^(n - 1),    E(other) = w / A^n                                             (3)
+    E(h) = N(e) prod_agreeing a_i prod_others (b_i / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)                (2)
+    E(one) = sum_i a_i / A prod_{j not i} (b_j / A),    E(other) = prod_i (c_i / A)                          (3)
 
-w is the probability of a wrong identity, and of a map of another place, in which all of them are. Sightings of one
-landmark count once, by their mean: a recogniser errs in the same way again. The vehicle is located when the best start
-outweighs all others together, and (3), by `ODDS`, and when its heading is known well enough to linearise at it.
+E(one) is that of a single right identity, E(other) that of a map of another place, which is a priori as probable as this
+one. With w the probability of a wrong identity, ``a = 1 - w, b = w, c = 1`` for a landmark that was seen several times. One
+that was seen once is a wrong identity, or new: with v the share of the sightings that show a landmark for the first time,
+``a = 1, b = w / ((1 - w) v), c = 1 + b``. Sightings of one landmark count once, by their mean: a recogniser errs in the
+same way again. The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`, and when its
+heading is known well enough to linearise at it.
 
 Landmarks that stand elsewhere have moved: the estimator gets the map without them. Some of them may also agree at a wrong
 start. For `WATCHED_S` after the first start all sightings are therefore weighed again: where a start outweighs the one in
@@ -53,7 +56,6 @@ from sonar_graph.models import (
     identify,
     listed,
     locate,
-    moved_line,
 )
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.states import (
@@ -67,7 +69,7 @@ from sonar_graph.states import (
 
 WRONG = 0.1
 """Probability of a wrong identity."""
-ODDS = 1e4
+ODDS = 1e3
 """Odds from which on the vehicle is located."""
 AGREES = 13.8
 """Chi-square quantile of 99.9 %, two degrees of freedom."""
@@ -313,10 +315,11 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     starts = candidates(data)
     if not starts:
         return None
-    n = len(data.is_of)
-    log_others = math.log(WRONG / data.area_m2)
-    of_other_place = math.log(WRONG) - n * math.log(data.area_m2)
-    one = math.log(n * (1.0 - WRONG) / data.area_m2) + (n - 1) * log_others
+    weights = data.weights
+    log_area = math.log(data.area_m2)
+    all_wrong = float(np.sum(weights.wrong - log_area))
+    one = float(np.logaddexp.reduce(all_wrong + weights.right - weights.wrong))  # (3)
+    of_other_place = float(np.sum(weights.elsewhere - log_area))  # (3)
     best = starts[0]
     rivals = [start.log_evidence for start in starts[1:]] + [of_other_place, one]
     weight = float(np.logaddexp.reduce(rivals))
@@ -336,7 +339,8 @@ def map_data(sightings: list[MapSighting], known: KnownMap) -> "MapData":
     reach_m = float(np.linalg.norm(q, axis=1).max())
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
     is_of = np.unique(rows)[:, None] == rows
-    return MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2)
+    weights = IdentityWeights.of(is_of.sum(axis=1))
+    return MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2, weights)
 
 
 def candidates(data: "MapData") -> list[FoundStart]:
@@ -355,6 +359,30 @@ def candidates(data: "MapData") -> list[FoundStart]:
         if not any(is_same(start.parameters, better) for better in starts):
             starts.append(start)
     return starts
+
+
+class IdentityWeights(NamedTuple):
+    """Logarithms of the weights in (2) and (3) of l landmarks that were seen, shape (l,) each."""
+
+    right: Floats
+    """a: seen where it stands."""
+    wrong: Floats
+    """b: another landmark was seen, which may stand anywhere."""
+    elsewhere: Floats
+    """c: seen in a map of another place."""
+
+    @classmethod
+    def of(cls, counts: Any) -> "IdentityWeights":
+        """Weights by the number of sightings of each landmark, shape (l,)."""
+        is_once = counts == 1
+        # the next landmark counts as one that is seen again
+        again = np.count_nonzero(~is_once) + 1
+        v = again / (again + np.sum(counts - 1))
+        odds = WRONG / ((1.0 - WRONG) * v)
+        right = np.where(is_once, 1.0, 1.0 - WRONG)
+        wrong = np.where(is_once, odds, WRONG)
+        elsewhere = np.where(is_once, 1.0 + odds, 1.0)
+        return cls(np.log(right), np.log(wrong), np.log(elsewhere))
 
 
 class MapData(NamedTuple):
@@ -376,6 +404,7 @@ class MapData(NamedTuple):
     """Joint covariance of the places, shape (2 m, 2 m)."""
     area_m2: float
     """A."""
+    weights: IdentityWeights
 
     @property
     def place_cov(self) -> Floats:
@@ -439,8 +468,8 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     _, log_det = np.linalg.slogdet(2.0 * math.pi * W)
     log_density = -0.5 * float(e @ np.linalg.solve(W, e) + log_det)
-    wrong = np.count_nonzero(~agreeing) * math.log(WRONG / data.area_m2)
-    right = log_density + len(q) * math.log(1.0 - WRONG)
+    wrong = float(np.sum(data.weights.wrong[~agreeing] - math.log(data.area_m2)))
+    right = log_density + float(np.sum(data.weights.right[agreeing]))
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
     prior = math.log(2.0 * math.pi * data.area_m2)
     rows = frozenset(seen[agreeing].tolist())
@@ -614,9 +643,7 @@ class StartInMap:
             "causal poses until then are wrong"
             for after_s in self._locator.again_s()
         ]
-        moved = self._locator.moved
-        gone = [moved_line(moved, is_mapped_again=True)] if moved else []
-        return [*again, *gone, *withheld_of(self._inner)]
+        return [*again, *withheld_of(self._inner)]
 
 
 def make_estimator(make: MakeEstimator, calibration: Calibration) -> Any:

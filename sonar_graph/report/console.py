@@ -13,6 +13,7 @@ from sonar_graph.evaluation import (
     score_keys,
 )
 from sonar_graph.report import sentences
+from sonar_graph.report.given_map import located_line
 from sonar_graph.table import ABSENT
 
 # columns after the two position errors; those that no run has are left out
@@ -114,6 +115,9 @@ def _lines_below(comparison: Comparison) -> list[str]:
         if line not in doubtful
     ]
     lines += sentences.lost_runs(comparison)
+    if located := located_line(comparison):
+        scored = comparison.environment["scored instants"]
+        lines.append(f"{located} Scored: {scored}")
     lines += sentences.refusal_lines(comparison)
     lines += sentences.withheld_lines(comparison)
     lines += [

@@ -30,6 +30,16 @@ def seen_landmarks(run: RunResult) -> set[int]:
     return set() if run.detections is None else set(run.detections.landmark_ids)
 
 
+def used_landmarks(run: RunResult) -> set[int]:
+    """Landmarks with a detection that changed the estimate."""
+    if run.detections is None:
+        return set()
+    ids = run.detections.landmark_ids.tolist()
+    outcomes = run.detections.outcomes
+    used = (Outcome.USED, Outcome.NEW)
+    return {i for i, each in zip(ids, outcomes, strict=True) if each in used}
+
+
 def located_line(comparison: Comparison) -> str:
     """When and where each run was located in the map; empty where the start was not to be found in it."""
     sequence = comparison.sequence
@@ -43,7 +53,7 @@ def located_line(comparison: Comparison) -> str:
         seconds = (run.causal.stamps_ns[0] - sequence.start_ns) * 1e-9
         x, y, _ = run.causal.positions[0].tolist()
         parts.append(f"{run.estimator}: after {seconds:.1f} s at ({x:.2f}, {y:.2f}) m")
-    return f"Located in the map (star): {', '.join(parts)}."
+    return f"Located in the map: {', '.join(parts)}."
 
 
 def draw_given_map(panel: Axes, comparison: Comparison) -> None:
@@ -95,6 +105,9 @@ def given_map_table(comparison: Comparison) -> Table | None:
                 cells.append("not seen")
             elif found is None:
                 cells.append(ABSENT)
+            elif landmark_id not in used_landmarks(run):
+                # where it stands is not known by this dive
+                cells.append("refused")
             else:
                 away_m = fixed(math.hypot(*(found - given)[:2]), DECIMALS)
                 is_moved = landmark_id in moved_landmarks(run)

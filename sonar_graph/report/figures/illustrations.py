@@ -193,7 +193,8 @@ def _captions(comparison: Comparison) -> dict[str, str]:
         run.landmarks is not None and len(run.landmarks) for run in comparison.runs
     )
     landmarks = f" Ellipses hold 95 %{as_large}."
-    located = "" if comparison.is_aligned else located_line(comparison)
+    line = "" if comparison.is_aligned else located_line(comparison)
+    located = line.replace("map:", "map (star):", 1)
     gone = paths_cut_off(comparison)
     far = error_figures.errors_cut_off(comparison)
     return {
