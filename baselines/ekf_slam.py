@@ -29,9 +29,9 @@ from baselines.events import (
     NO_ROW,
     UNKNOWN,
     Events,
+    FilterSetup,
     Motion,
     Sonar,
-    Surroundings,
     Views,
     elevation_of_new,
     feel,
@@ -293,9 +293,7 @@ def update_depth(
 
 
 @compiled
-def follow(
-    x: Floats, P: Floats, events: Events, around: Surroundings, first: int
-) -> int:
+def follow(x: Floats, P: Floats, events: Events, setup: FilterSetup, first: int) -> int:
     """Predict to epochs, update by depths and frames, in turn from one event on; the number of the event that is next.
 
     It stops before a frame with a new landmark, and after an epoch at which more is measured, or where the Euler angles
@@ -303,24 +301,24 @@ def follow(
     """
     order = events.order
     k = first
-    while is_followed(events, around, k, first):
+    while is_followed(events, setup, k, first):
         motion = motion_to(events, k)
         # a motion over a gap has been reduced
-        if around.has_rate and not events.is_gap[k]:
+        if setup.has_rate and not events.is_gap[k]:
             R = rotation_from_euler(x[ROLL], x[PITCH], x[YAW])
-            motion = remove_rate(motion, ZERO, R.T @ vec(around.earth_rad_s))
+            motion = remove_rate(motion, ZERO, R.T @ vec(setup.earth_rad_s))
         row = order.row[k]
         if order.kind[k] == EPOCH:
             predict(x, P, motion)
             # gravity is compared with the specific force in the frame where its interval began
-            feel(around.felt, motion)
+            feel(setup.felt, motion)
             if order.has_more[k] or abs(x[PITCH]) >= MOST_PITCH_RAD:
                 return k + 1
         elif order.kind[k] == DEPTH:
             z_m = events.value[row, 2]
             variance_m2 = events.noise[row, 2, 2]
-            update_depth(x, P, motion, around.port_m, z_m, variance_m2)
-        elif observe(x, P, motion, around.sonar, events.views, row) != NO_ROW:
+            update_depth(x, P, motion, setup.port_m, z_m, variance_m2)
+        elif observe(x, P, motion, setup.sonar, events.views, row) != NO_ROW:
             return k
         k += 1
     return k
@@ -399,7 +397,7 @@ class EkfSlam(FilterShell):
 
     def follow(self, events: Events, first: int) -> int:
         """Predict to epochs, update by depths and frames, in turn; the number of the event that is next."""
-        return follow(self._x, self._P, events, self.around, first)
+        return follow(self._x, self._P, events, self.setup, first)
 
     def observe(self, motion: Motion, views: Views, first: int) -> int:
         """Update by range and azimuth of known landmarks, (6) and (7)."""

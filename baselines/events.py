@@ -276,7 +276,7 @@ class Events(NamedTuple):
     views: Views
 
 
-class Surroundings(NamedTuple):
+class FilterSetup(NamedTuple):
     """What a filter knows beside its state and the events."""
 
     felt: Felt
@@ -294,10 +294,10 @@ class Surroundings(NamedTuple):
 
 
 @inlined
-def is_followed(events: Events, around: Surroundings, k: int, first: int) -> bool:
+def is_followed(events: Events, setup: FilterSetup, k: int, first: int) -> bool:
     """True for an epoch, a depth or a frame; a motion over a gap depends on the state, and is bridged in its turn."""
     kind = events.order.kind[k]
-    is_frame = kind == FRAME and around.follows_frames
+    is_frame = kind == FRAME and setup.follows_frames
     return (kind <= DEPTH or is_frame) and (k == first or not events.is_gap[k])
 
 

@@ -25,11 +25,11 @@ from baselines.events import (
     Call,
     Events,
     Felt,
+    FilterSetup,
     Motion,
     Order,
     Samples,
     Sonar,
-    Surroundings,
     Views,
     in_frame,
     in_order,
@@ -170,7 +170,7 @@ class FilterShell(ABC):
             round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
         )
         earth = earth_rate_in_world(calibration)
-        self.around = Surroundings(
+        self.setup = FilterSetup(
             felt=Felt.nothing(),
             port_m=np.array(calibration.depth.port_m),
             earth_rad_s=np.zeros(3) if earth is None else earth,
@@ -553,9 +553,9 @@ class FilterShell(ABC):
     def _motion_to(self, events: Events, k: int) -> Motion:
         """Motion to an event without the gyro bias of the state and the Earth's rate."""
         motion = motion_to(events, k)
-        if events.is_gap[k] or not self.around.has_rate:
+        if events.is_gap[k] or not self.setup.has_rate:
             return motion
-        earth_i = self.attitude().T @ self.around.earth_rad_s
+        earth_i = self.attitude().T @ self.setup.earth_rad_s
         return remove_rate(motion, vec(self.gyro_bias()), vec(earth_i))
 
     def _correct_at(self, epoch_ns: int) -> None:
@@ -572,7 +572,7 @@ class FilterShell(ABC):
         duration_s = (epoch_ns - self._opened_ns) * 1e-9
         velocity_i, variance_i = self._opened_velocity
         velocity_j, variance_j = self.odometry.velocity_at_imu(epoch_ns)
-        turn, impulse = self.around.felt
+        turn, impulse = self.setup.felt
         up = up_direction(
             impulse / duration_s, turn, velocity_i, velocity_j, duration_s
         )
@@ -585,7 +585,7 @@ class FilterShell(ABC):
             self.update_up(up, sigma_rad, turn)
         self._opened_ns = epoch_ns
         self._opened_velocity = (velocity_j, variance_j)
-        self.around.felt.forget()
+        self.setup.felt.forget()
 
     def _see(self, motion: Motion, views: Views, first: int) -> None:
         """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
@@ -669,7 +669,7 @@ class FilterShell(ABC):
         if kind != END:  # an estimate alone changes nothing
             self._may_be_far = self.params.far_views
             if self._may_be_far:
-                self.around = self.around._replace(follows_frames=False)
+                self.setup = self.setup._replace(follows_frames=False)
         shared = self._shared(motion, kind, more)
         for columns, values in zip(events.motions, shared, strict=True):
             columns[k] = values

@@ -53,9 +53,9 @@ from baselines.events import (
     NO_ROW,
     UNKNOWN,
     Events,
+    FilterSetup,
     Motion,
     Sonar,
-    Surroundings,
     Views,
     elevation_of_new,
     feel,
@@ -302,7 +302,7 @@ def update_depth(
 
 @compiled
 def follow(
-    state: InvariantState, events: Events, around: Surroundings, first: int
+    state: InvariantState, events: Events, setup: FilterSetup, first: int
 ) -> int:
     """Predict to epochs, update by depths and frames, in turn from one event on; the number of the event that is next.
 
@@ -310,27 +310,27 @@ def follow(
     """
     order = events.order
     k = first
-    while is_followed(events, around, k, first):
+    while is_followed(events, setup, k, first):
         motion = motion_to(events, k)
         # a motion over a gap has been reduced
-        if around.has_rate and not events.is_gap[k]:
+        if setup.has_rate and not events.is_gap[k]:
             R = mat(state.R)
             up = R.z if state.is_level else ZERO
             bias = gyro_bias_of(state.bias, up)
-            motion = remove_rate(motion, bias, R.T @ vec(around.earth_rad_s))
+            motion = remove_rate(motion, bias, R.T @ vec(setup.earth_rad_s))
         row = order.row[k]
         if order.kind[k] == EPOCH:
             duration_s = (order.end_ns[k] - order.start_ns[k]) * 1e-9
-            predict(state, motion, around.walk_density**2 * duration_s)
+            predict(state, motion, setup.walk_density**2 * duration_s)
             # gravity is compared with the specific force in the frame where its interval began
-            feel(around.felt, motion)
+            feel(setup.felt, motion)
             if order.has_more[k]:
                 return k + 1
         elif order.kind[k] == DEPTH:
             z_m = events.value[row, 2]
             variance_m2 = events.noise[row, 2, 2]
-            update_depth(state, motion, around.port_m, z_m, variance_m2)
-        elif observe(state, motion, around.sonar, events.views, row) != NO_ROW:
+            update_depth(state, motion, setup.port_m, z_m, variance_m2)
+        elif observe(state, motion, setup.sonar, events.views, row) != NO_ROW:
             return k
         k += 1
     return k
@@ -381,7 +381,7 @@ class InvariantEkf(FilterShell):
         params: InvariantEkfParams | None = None,
     ) -> None:
         super().__init__(calibration, odometry, params or InvariantEkfParams())
-        self.around = self.around._replace(walk_density=bias_sigmas(calibration)[1])
+        self.setup = self.setup._replace(walk_density=bias_sigmas(calibration)[1])
         self._state = with_map(start_state(calibration), self._known)
 
     def state(self) -> tuple[int, InvariantState]:
@@ -395,7 +395,7 @@ class InvariantEkf(FilterShell):
 
     def follow(self, events: Events, first: int) -> int:
         """Predict to epochs, update by depths and frames, in turn; the number of the event that is next."""
-        return follow(self._state, events, self.around, first)
+        return follow(self._state, events, self.setup, first)
 
     def observe(self, motion: Motion, views: Views, first: int) -> int:
         """Update by range and azimuth of known landmarks, (5)."""
