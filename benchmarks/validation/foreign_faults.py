@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 from foreign_world import Floats, Log, Mask
+from scipy.spatial.transform import Rotation
 
 BURST_S = 2.0
 """Typical length of a stretch without measurements."""
@@ -75,6 +76,17 @@ def turned(values: str, axes: Floats) -> Spoil:
 
     def spoil(log: Log, _: float) -> None:
         setattr(log, values, getattr(log, values) @ axes.T)
+
+    return spoil
+
+
+def leaning(axis: str, *columns: str) -> Spoil:
+    """Turn vectors about a level axis, by degrees."""
+
+    def spoil(log: Log, degrees: float) -> None:
+        turn = Rotation.from_euler(axis, degrees, degrees=True)
+        for values in columns:
+            setattr(log, values, turn.apply(getattr(log, values)))
 
     return spoil
 
@@ -212,6 +224,11 @@ def roles(*names: str) -> frozenset[str]:
     return frozenset(names)
 
 
+LEANS = (5.0, 15.0, 30.0)
+LEANING = r"mounting (roll|pitch)|pitch of Doppler log or IMU|start (roll|pitch): value"
+EITHER = roles("imu", "dvl", "start")
+
+
 # fmt: off
 def of_angular_rate() -> Iterator[Fault]:
     row = partial(Fault, "angular rate", roles=roles("imu"))
@@ -222,6 +239,9 @@ def of_angular_rate() -> Iterator[Fault]:
     yield row("late", "seconds, of all IMU rows", (0.5, 1.0, 1.5), imu_late, words, roles=roles("imu", "dvl"))
     yield row(SENSE, NEGATED, AGAIN, one_axis_negated("rate"), gyro)
     yield row(SENSE, "x and z exchanged", AGAIN, turned("rate", X_Z), gyro)
+    of_imu = leaning("x", "rate", "force"), leaning("y", "rate", "force")
+    yield row(SENSE, "IMU rolled, degrees", LEANS, of_imu[0], LEANING, roles=EITHER)
+    yield row(SENSE, "IMU pitched, degrees", LEANS, of_imu[1], LEANING, roles=EITHER)
     yield row("unit", "degrees", (DEGREE, DEGREE, DEGREE), scaled("rate"), r"gyro.*degrees")
     row = partial(row, needs=roles("heading"))
     yield row("scale", "factor", (1.02, 1.05, 0.95), scaled("rate"), r"angular_velocity_scale")
@@ -253,6 +273,8 @@ def of_velocity() -> Iterator[Fault]:
     for name, axes in MIRRORS.items():
         may_change = either if name == "x and y negated" else roles("dvl")
         yield row(SENSE, name, AGAIN, turned("velocity", axes), words, roles=may_change)
+    yield row(SENSE, "rolled, degrees", LEANS, leaning("x", "velocity"), LEANING, roles=EITHER)
+    yield row(SENSE, "pitched, degrees", LEANS, leaning("y", "velocity"), LEANING, roles=EITHER)
     quarter = turned("velocity", QUARTER_TURN)
     yield row(SENSE, "turned by 90 degrees", AGAIN, quarter, r"DVL axes|mounting yaw", roles=either)
     yield row("marked invalid", "share, huge variance", SHARES, Marked("velocity", "dvl_s", "velocity", True), LEFT_OUT)

@@ -800,7 +800,7 @@ def resumed(
     return [known[f"{what} {item}"] for item in items]
 
 
-CHUNK = 2
+CHUNK = 20
 """Number of items between two additions to the file."""
 
 

@@ -908,7 +908,9 @@ def heading_turn(
         yield row
         return
     offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
-    rpy = numbers(turned_mounting(right.calibration.dvl.mounting, angle.value), 4)
+    rpy = numbers(
+        turned_mounting(right.calibration.dvl.mounting, (0.0, 0.0, angle.value)), 4
+    )
     vertical = vertical_bias(right, motion)
     is_biased = vertical is not None and vertical.acts
     first = "once the gyro bias is put right, which comes first, " if is_biased else ""

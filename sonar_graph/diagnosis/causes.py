@@ -140,7 +140,7 @@ def pitch_advice(q: Values, calibration: Calibration) -> Advice:
 def pitched_line(role: str, calibration: Calibration, pitch_rad: float) -> str:
     """Setting of a mounting after a turn about the body's y axis."""
     mounting: Mounting = getattr(calibration, role).mounting
-    rpy_rad = turned_mounting(mounting, pitch_rad, "y")
+    rpy_rad = turned_mounting(mounting, (0.0, pitch_rad, 0.0))
     return f"`{role}.mounting.rpy_rad = {numbers(rpy_rad, 4)}`"
 
 
@@ -166,7 +166,7 @@ def pitched_one(
 def sonar_turn_advice(q: Values, calibration: Calibration) -> Advice:
     """Ranges that change as if the landmarks were seen in another direction."""
     turn_rad = float(np.arcsin(np.clip(q[0].real, -1.0, 1.0)))
-    rpy_rad = turned_mounting(calibration.sonar.mounting, turn_rad)
+    rpy_rad = turned_mounting(calibration.sonar.mounting, (0.0, 0.0, turn_rad))
     side = "left" if turn_rad > 0 else "right"
     return Advice(
         f"ranges change as for landmarks {abs(np.degrees(turn_rad)):.2g}° further to the {side}: the sonar is turned on the "

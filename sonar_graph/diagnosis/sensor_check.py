@@ -117,6 +117,8 @@ from sonar_graph.navigation.alignment import (
 from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
+LEVEL_TURNS = ("DVL mounting roll", "DVL mounting pitch")
+TURNED = "velocity changes as the IMU measures, turned by as much"
 DVL_AXES = "DVL axes"
 WRONG_AXES = "wrong axes"
 ANY_AXES = "axes of gyros, accelerometers or Doppler log"
@@ -129,6 +131,8 @@ LONGEST_S = 600.0
 """Longest part in which Doppler log and accelerometers are compared, in the middle of the log."""
 LEAST_OFFSET_S = 0.01
 LEAST_YAW_RAD = np.radians(0.25)
+LEAST_LEAN_RAD = np.radians(3.0)
+"""Roll and pitch of a mounting that is not measured."""
 LEAST_SCALE = 0.002
 LARGE_OFFSET_S = 0.2
 """Beyond it the Doppler log contradicts the accelerometers so much that results are doubtful."""
@@ -214,16 +218,18 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if any(finding.estimate.reason == NO_AXES for finding in axes):
         return [*forces, *axes]
     match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    if matters(match.yaw, LARGE_TURN_RAD):
-        pair = TurnedPair(sequence, match.yaw.value)
-        cause = "velocity changes as the IMU measures, turned by as much"
-        angle = in_degrees(match.yaw)
-        axes.append(pair.finding(YAW, angle, cause))
+    if matters(match.turn[2], LARGE_TURN_RAD):
+        pair = TurnedPair(sequence, np.array([0.0, 0.0, match.turn[2].value]))
+        axes.append(pair.finding(YAW, in_degrees(match.turn[2]), TURNED))
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
     # no other comparison is worth anything beside gyros that are wrong
     if rates := rate_findings(sequence, config):
         return [*forces, *axes, *rates]
+    leaning, sequence = leaning_pair(match, sequence)
+    if leaning:
+        axes += leaning
+        match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
     is_turned = any(finding.quantity == YAW for finding in axes)
     x, y, z = (
         replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias
@@ -480,7 +486,7 @@ def axes_findings(
         sequence = scaled_gyros(sequence, found.gyro)
     turn = vertical_turn(found.dvl)
     if turn is not None:
-        pair = TurnedPair(sequence, turn)
+        pair = TurnedPair(sequence, np.array([0.0, 0.0, turn]))
         cause = axes_cause(found)
         findings.append(pair.finding(DVL_AXES, unknown(WRONG_AXES), cause))
         sequence = pair.corrected()
@@ -725,11 +731,12 @@ def dvl_findings(
     """Time offset, mounting yaw and scale of the DVL."""
     offset = with_instant(found.offset, sequence.imu)
     late = offset_row("DVL against IMU", offset, "dvl", config)
-    yaw_rad = found.yaw.value if found.yaw.is_known else 0.0
-    rpy = turned_mounting(sequence.calibration.dvl.mounting, yaw_rad)
+    yaw = found.turn[2]
+    turn_rad = (0.0, 0.0, yaw.value if yaw.is_known else 0.0)
+    rpy = turned_mounting(sequence.calibration.dvl.mounting, turn_rad)
     turned = Finding(
         YAW,
-        in_degrees(found.yaw),
+        in_degrees(yaw),
         "°",
         "turn the DVL's mounting",
         line=f"`dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
@@ -742,7 +749,7 @@ def dvl_findings(
     )
     return [
         judged(late, offset, LEAST_OFFSET_S, large=LARGE_OFFSET_S),
-        judged(turned, found.yaw, LEAST_YAW_RAD, large=LARGE_TURN_RAD),
+        judged(turned, yaw, LEAST_YAW_RAD, large=LARGE_TURN_RAD),
         judged(scaled, found.scale.minus(1.0), LEAST_SCALE, large=LARGE_SCALE),
     ]
 
@@ -809,7 +816,19 @@ def corrected_sequence(
     velocity = dvl.velocity * (match.scale.value if is_scaled else 1.0)
     moved = Dvl(dvl.stamps_ns + shift_ns, velocity, dvl.velocity_cov)
     right = replace(sequence, dvl=moved, calibration=calibration)
-    return TurnedPair(right, match.yaw.value).as_if("dvl") if is_turned else right
+    turn_rad = np.array([0.0, 0.0, match.turn[2].value])
+    return TurnedPair(right, turn_rad).as_if("dvl") if is_turned else right
+
+
+def leaning_pair(match: DvlMatch, sequence: Sequence) -> tuple[list[Finding], Sequence]:
+    """Doppler log and IMU that are turned against each other about a level axis, and the sequence with it put right."""
+    known_rad = [one.value if one.is_known else 0.0 for one in match.turn[:2]]
+    axis = int(np.argmax(np.abs(known_rad)))
+    if not matters(match.turn[axis], LEAST_LEAN_RAD):
+        return [], sequence
+    pair = TurnedPair(sequence, np.array([*known_rad, 0.0]))
+    angle = in_degrees(match.turn[axis])
+    return [pair.finding(LEVEL_TURNS[axis], angle, TURNED)], pair.corrected()
 
 
 def surest_bias(

@@ -7,6 +7,7 @@ Roll and pitch at the start come from a rest or, if the vehicle moves there, fro
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
@@ -159,11 +160,11 @@ def bias_findings(
 
 
 def turned_mounting(
-    mounting: Mounting, angle_rad: float, axis: str = "z"
+    mounting: Mounting, turn_rad: ArrayLike
 ) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a mounting after a turn about an axis of the body."""
+    """Roll, pitch and yaw of a mounting after a turn, a rotation vector along the body's axes, shape (3,)."""
     before = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
-    after = Rotation.from_euler(axis, angle_rad) * before
+    after = Rotation.from_rotvec(turn_rad) * before
     yaw, pitch, roll = after.as_euler("ZYX").tolist()
     return roll, pitch, yaw
 
@@ -307,9 +308,9 @@ def tilt_findings(
     if start.states("rpy_rad"):
         turned = calibration.imu.mounting
         for about, angle, stated_rad in zip(
-            "xy", (roll, pitch), start.rpy_rad, strict=False
+            np.eye(3), (roll, pitch), start.rpy_rad, strict=False
         ):
-            rpy_rad = turned_mounting(turned, angle.value - stated_rad, about)
+            rpy_rad = turned_mounting(turned, (angle.value - stated_rad) * about)
             turned = turned.model_copy(update={"rpy_rad": rpy_rad})
         of_imu = f"`imu.mounting.rpy_rad = {numbers(turned.rpy_rad, 4)}`"
         line += f" or, if that start is sure, {of_imu}"

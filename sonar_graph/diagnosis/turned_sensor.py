@@ -1,8 +1,9 @@
-"""Which of IMU and Doppler log is turned about the vertical: gravity and accelerations fit both alike.
+"""Which of IMU and Doppler log is turned: gravity and accelerations fit both alike.
 
-A turn of the Doppler log by an angle, and one of the IMU by its opposite, differ only in where the vehicle's axes are.
-Sensors with axes of their own decide: sightings of landmarks, or the course by position fixes from a known heading at
-the start. A heading may come from the turned IMU itself: it decides only where it agrees with the Doppler log.
+A turn of the Doppler log, and the opposite one of the IMU, differ only in where the vehicle's axes are. About the
+vertical, sensors with axes of their own decide: sightings of landmarks, or the course by position fixes from a known
+heading at the start. A heading may come from the turned IMU itself: it decides only where it agrees with the Doppler log.
+About level axes a stated start decides, from which gravity differs where the IMU is turned.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,8 @@ from sonar_graph.diagnosis.findings import (
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.signals import CLEARLY_BETTER
-from sonar_graph.diagnosis.start import turned_mounting
+from sonar_graph.diagnosis.start import find_start_tilt, turned_mounting
+from sonar_graph.measurements import Floats
 from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
@@ -34,8 +36,8 @@ class TurnedPair:
     """IMU and Doppler log that are turned against each other."""
 
     sequence: Sequence
-    yaw_rad: float
-    """Turn of the Doppler log that would make them agree."""
+    turn_rad: Floats
+    """Turn of the Doppler log that would make them agree: a rotation vector along the body's axes, shape (3,)."""
 
     def as_if(self, role: str) -> Sequence:
         """The sequence with the mounting of one of them, ``dvl`` or ``imu``, put right."""
@@ -48,12 +50,14 @@ class TurnedPair:
     def mounting(self, role: str) -> Mounting:
         """Mounting of one of them after its turn."""
         before: Mounting = getattr(self.sequence.calibration, role).mounting
-        angle_rad = self.yaw_rad if role == "dvl" else -self.yaw_rad
-        rpy_rad = turned_mounting(before, angle_rad)
+        turn_rad = self.turn_rad if role == "dvl" else -self.turn_rad
+        rpy_rad = turned_mounting(before, turn_rad)
         return before.model_copy(update={"rpy_rad": rpy_rad})
 
     def wrong_one(self) -> str:
-        """``dvl`` or ``imu``; empty where no third sensor decides."""
+        """``dvl`` or ``imu``; empty where nothing else decides."""
+        if self.turn_rad[:2].any():
+            return self.wrong_one_by_start()
         scatters = dict[str, float]()
         for role in ("dvl", "imu"):
             right = self.as_if(role)
@@ -72,6 +76,21 @@ class TurnedPair:
         is_clear = scatters[worst] > CLEARLY_BETTER * scatters[best]
         return best if is_clear else ""
 
+    def wrong_one_by_start(self) -> str:
+        """The one whose turn brings gravity to a stated start; empty without one, or where neither clearly does."""
+        start = self.sequence.calibration.start
+        if not start.states("rpy_rad"):
+            return ""
+        off_rad = dict[str, float]()
+        for role in ("dvl", "imu"):
+            found = find_start_tilt(self.as_if(role))
+            if found.tilt is None:
+                return ""
+            tilt_rad = np.array([found.tilt.roll_rad, found.tilt.pitch_rad])
+            off_rad[role] = float(np.linalg.norm(tilt_rad - start.rpy_rad[:2]))
+        best, worst = sorted(off_rad, key=off_rad.__getitem__)
+        return best if off_rad[best] < NEAR * off_rad[worst] else ""
+
     def is_near_course(self, right: Sequence, motion: BodyMotion) -> bool:
         """True where the fixes move from the start as the heading there and the Doppler log have it."""
         start = right.calibration.start
@@ -82,7 +101,7 @@ class TurnedPair:
             return False
         sigma = np.hypot(course.angle.sigma, start.rpy_sigma_rad[2])
         off_rad = abs(wrap_angle(course.angle.value - start.rpy_rad[2]))
-        return bool(off_rad + 2 * sigma < NEAR * abs(self.yaw_rad))
+        return bool(off_rad + 2 * sigma < NEAR * float(np.linalg.norm(self.turn_rad)))
 
     def finding(self, quantity: str, estimate: Estimate1D, cause: str) -> Finding:
         """A grave finding with the line for the one that is turned, or for either."""

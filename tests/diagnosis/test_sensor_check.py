@@ -253,9 +253,10 @@ def told(
 @pytest.mark.parametrize("acts", [True, False])
 def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
     offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
-    numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
     match = DvlMatch(
-        *numbers,
+        offset=Estimate1D(offset, 1e-5),
+        turn=told(0.0, 0.0, yaw, sigma=1e-5),
+        scale=Estimate1D(scale, 1e-5),
         lever=told(-0.2, 0.0, -0.15),
         gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6),
     )

@@ -1,13 +1,16 @@
-"""A quarter turn between IMU and Doppler log: the turned one is named where a third sensor shows it, else both are."""
+"""A turn between IMU and Doppler log: the turned one is named where something else shows it, else both are."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Heading, PositionFixes
+from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -17,11 +20,11 @@ WORLD = simulate_mission(MissionOptions(seed=4, duration_s=60, landmarks=40))
 OTHER = {"imu": "dvl", "dvl": "imu"}
 
 
-def with_turned(run: Sequence, role: str, yaw_rad: float) -> Sequence:
-    """Measurements of a sensor that is turned about the vertical under a calibration without it."""
-    c = np.cos(yaw_rad)
-    s = np.sin(yaw_rad)
-    body_R_turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def with_turned(
+    run: Sequence, role: str, angle_rad: float, axis: str = "z"
+) -> Sequence:
+    """Measurements of a sensor that is turned about an axis of the body under a calibration without it."""
+    body_R_turned = Rotation.from_euler(axis, angle_rad).as_matrix()
     section = getattr(run.calibration, role)
     body_R_sensor = section.mounting.pose().rotation().matrix()
     # what a sensor measures whose true mounting is the turn of the stated one
@@ -81,6 +84,62 @@ def test_a_third_sensor_shows_which_is_turned_and_its_line_puts_all_right(
     *_, found_rad = line_of(finding)[role]["mounting"]["rpy_rad"]
     *_, stated_rad = getattr(WORLD.calibration, role).mounting.rpy_rad
     assert found_rad - stated_rad == pytest.approx(yaw_rad, abs=0.03)
+
+
+def swaying() -> Sequence:
+    """A level vehicle that turns, sways and heaves: velocities along all axes of the body show how it is turned."""
+    t = np.arange(0.0, 90.0, 0.02)
+    rng = np.random.default_rng(3)
+    turn = Rotation.from_rotvec(0.8 * np.outer(np.sin(0.2 * t), [0.0, 0.0, 1.0]))
+    ahead = 1.0 + 0.2 * np.sin(0.5 * t)
+    velocity = np.column_stack([ahead, 0.3 * np.sin(0.9 * t), 0.2 * np.sin(0.7 * t)])
+    acceleration = np.gradient(turn.apply(velocity), t, axis=0)
+    force = turn.inv().apply(np.add(acceleration, [0.0, 0.0, 9.80665]))
+    rate = np.column_stack([0.0 * t, 0.0 * t, 0.16 * np.cos(0.2 * t)])
+    stamps_ns = np.rint(t * 1e9).astype(np.int64)
+    slow = slice(None, None, 10)
+    noisy = velocity[slow] + 0.005 * rng.standard_normal((len(t[slow]), 3))
+    start = Start(position_m=(0.0, 0.0, 0.0), rpy_rad=(0.0, 0.0, 0.0))
+    return Sequence(
+        name="swaying",
+        calibration=Calibration(start=start),
+        imu=Imu(
+            stamps_ns,
+            rate + 1e-4 * rng.standard_normal(rate.shape),
+            force + 0.01 * rng.standard_normal(force.shape),
+        ),
+        dvl=Dvl(stamps_ns[slow], noisy, np.full((len(noisy), 3, 3), np.nan)),
+    )
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+@pytest.mark.parametrize(
+    ("role", "axis", "angle_rad"),
+    [("imu", "x", 0.2), ("dvl", "x", -0.5), ("imu", "y", -0.5), ("dvl", "y", 0.1)],
+)
+def test_a_stated_start_shows_which_is_rolled_or_pitched(
+    role: str, axis: str, angle_rad: float, is_stated: bool
+) -> None:
+    """Its line puts all right; without a start both lines are given, and no other sensor is blamed."""
+    run = swaying() if is_stated else with_measured_start(swaying())
+    finding, *others = acting(with_turned(run, role, angle_rad, axis))
+    # a start that nobody states would be measured by the turned IMU
+    assert not (is_stated and others)
+    assert finding.quantity.endswith(
+        {"x": "mounting roll", "y": "mounting pitch"}[axis]
+    )
+    lines = re.findall(r"`(\w+)\.mounting\.rpy_rad = \[(.*?)\]`", finding.line)
+    found = {name: [float(angle) for angle in text.split(",")] for name, text in lines}
+    assert set(found) == ({role} if is_stated else {"imu", "dvl"})
+    roll, pitch, yaw = found[role]
+    turned = {"x": roll, "y": pitch}[axis]
+    assert turned == pytest.approx(angle_rad, abs=0.02)
+    assert abs(roll) + abs(pitch) + abs(yaw) - abs(turned) < 0.04
+
+
+def test_mountings_that_are_right_within_two_degrees_are_left_alone() -> None:
+    assert acting(swaying()) == []
+    assert acting(with_turned(swaying(), "dvl", 0.03, "x")) == []
 
 
 @pytest.mark.parametrize("role", ["imu", "dvl"])

@@ -61,7 +61,7 @@ def test_offset_yaw_scale_and_gyro_bias_are_found():
     known = with_mounting(run, translation_m=(0.0,) * 3, rpy_rad=(1.5, 0.2, 0.3))
     found = match_dvl_to_imu(turned, run.dvl, known)
     assert_found(found.offset, OFFSET_S, 0.4)
-    assert_found(found.yaw, YAW_RAD, 0.03)
+    assert_found(found.turn[2], YAW_RAD, 0.03)
     assert_found(found.scale, SCALE, 0.02)
     for one, truth in zip(found.gyro_bias, on_its_side.apply(bias), strict=True):
         assert_found(one, truth, 0.3 * np.linalg.norm(bias))
@@ -79,7 +79,7 @@ def test_straight_and_steady_driving_tells_nothing():
     found = match_dvl_to_imu(
         Imu(np.arange(n) * 10_000_000, rate, force), log, calibration
     )
-    assert not any(one.is_known for one in (found.offset, found.scale, found.yaw))
+    assert not any(one.is_known for one in (found.offset, found.scale, found.turn[2]))
 
 
 def test_without_accelerometers_nothing_can_be_told():
@@ -128,7 +128,9 @@ def test_the_lever_arm_is_found_whatever_the_calibration_says():
         assert_found(one, truth, 0.4)
         assert_found(other, truth, 0.4)
         assert abs(one.value - other.value) < 0.25 * one.sigma
-    assert there.yaw.value == pytest.approx(here.yaw.value, abs=0.25 * here.yaw.sigma)
+    assert there.turn[2].value == pytest.approx(
+        here.turn[2].value, abs=0.25 * here.turn[2].sigma
+    )
 
 
 def on_a_plane(arm_m: np.ndarray) -> tuple[Imu, Dvl]:

@@ -1,4 +1,4 @@
-"""Time offset, mounting yaw, lever arm and scale of a Doppler log, from the accelerations that it shares with the IMU.
+"""Time offset, mounting, lever arm and scale of a Doppler log, from the accelerations that it shares with the IMU.
 
 The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise linear rates and the trapezoid rule::
 
@@ -23,7 +23,7 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
@@ -157,7 +157,7 @@ PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] *
 """Scale; turn, rad, about x and y near the calibration's; lever arm, m; biases, m/s² and rad/s."""
 # places among the parameters, after the offset
 SCALE = 1
-YAW = 4
+TURN = slice(2, 5)
 LEVER = slice(5, 8)
 GYRO_BIAS = slice(11, 14)
 LARGEST_STEP_LEFT = 0.01
@@ -169,7 +169,10 @@ HOPELESS_AFTER = 3
 """Round after which the search ends where neither offset nor turn nor scale is known."""
 # sigmas above which a number is reported as not known
 OFFSET_LIMIT_S = 0.1
-YAW_LIMIT_RAD = np.radians(2.0)
+SURE = 4.5
+"""Sigmas from which on a turn about x or y is none of the noise."""
+TURN_LIMITS_RAD = np.radians([1.0, 1.0, 2.0])
+"""About x and y the prior must not decide."""
 SCALE_LIMIT = 0.02
 LEVER_LIMIT_M = 0.25
 GYRO_BIAS_LIMIT_RAD_S = 5e-3
@@ -185,8 +188,8 @@ class DvlMatch:
 
     offset: Estimate1D
     """To be added to the log's stamps, s."""
-    yaw: Estimate1D
-    """To be added to the mounting's yaw, about the body's z axis, rad."""
+    turn: Estimates3D
+    """By which the mounting must be turned further: components of a rotation vector along the body's axes, rad."""
     scale: Estimate1D
     """Factor by which the log's velocities must be multiplied."""
     lever: Estimates3D
@@ -198,7 +201,8 @@ class DvlMatch:
     def unknown(cls, reason: str) -> DvlMatch:
         """Nothing is known, for one reason."""
         nothing = Estimate1D(np.nan, np.inf, reason)
-        return cls(nothing, nothing, nothing, (nothing,) * 3, (nothing,) * 3)
+        along_axes = (nothing,) * 3
+        return cls(nothing, along_axes, nothing, along_axes, along_axes)
 
 
 def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
@@ -209,7 +213,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     imu, dvl
         Rows of one run; without specific forces nothing is known.
     calibration
-        Mountings as far as they are known; the yaw found is on top of them.
+        Mountings as far as they are known; the turn found is on top of them.
     """
     if not np.isfinite(imu.specific_force).all():
         return DvlMatch.unknown("no accelerometers")
@@ -228,7 +232,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     lever = np.subtract(
         calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m
     )
-    yaw = 0.0
+    turned_by = Rotation.identity()
     scale = 1.0
     gyro_bias = np.zeros(3)
     for done in range(1, ROUNDS + 1):
@@ -236,7 +240,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
         path = InertialPath.of(
             Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force)
         )
-        turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
+        turned = scale * turned_by.apply(velocity)
         line_up = partial(velocity_changes, path, seconds, turned, runs, lever)
         if not are_enough(line_up(0.0), PRIOR_SIGMAS):
             return DvlMatch.unknown("too few Doppler samples between gaps")
@@ -246,21 +250,25 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
             found = found.without_shared_noise(line_up(found.offset_s), SCALE)
         parameters = found.fit.parameters
         sigma = np.sqrt(np.diag(found.fit.covariance))
-        turn = float(parameters[YAW])
+        turn = parameters[TURN]
+        # a large turn leaves residuals that make its sigma large
+        is_sure = (sigma[TURN] <= TURN_LIMITS_RAD) | (np.abs(turn) > SURE * sigma[TURN])
+        # the yaw has no prior that matters
+        turn = np.where(is_sure | [False, False, True], turn, 0.0)
         more = float(parameters[SCALE])
         drift = parameters[GYRO_BIAS]
         longer = np.where(sigma[LEVER] <= LEVER_LIMIT_M, parameters[LEVER], 0.0)
-        yaw += turn
+        turned_by = Rotation.from_rotvec(turn) * turned_by
         scale *= 1.0 + more
         gyro_bias = gyro_bias + drift
         lever = lever + longer
         # each in what it changes: rad or m/s
-        step = [turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]
+        step = [*turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]
         if np.linalg.norm(step) < LARGEST_STEP_LEFT:
             break
         is_known = (
             not found.reason
-            or sigma[YAW] <= YAW_LIMIT_RAD
+            or sigma[TURN][2] <= TURN_LIMITS_RAD[2]
             or sigma[SCALE] <= SCALE_LIMIT
         )
         if done >= HOPELESS_AFTER and not is_known:
@@ -268,19 +276,23 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     else:
         return DvlMatch.unknown(NO_MANOEUVRES)
 
-    def along_axes(values: Floats, sigmas: Floats, limit: float) -> Estimates3D:
+    def along_axes(
+        values: Floats, sigmas: Floats, limits: ArrayLike, reason: str
+    ) -> Estimates3D:
         x, y, z = (
-            Estimate1D(float(values[i]), float(sigmas[i])).limited(limit, NO_TURNS)
-            for i in range(3)
+            Estimate1D(float(value), float(sigma)).limited(float(limit), reason)
+            for value, sigma, limit in zip(
+                values, sigmas, np.broadcast_to(limits, 3), strict=True
+            )
         )
         return x, y, z
 
     return DvlMatch(
         found.offset().limited(OFFSET_LIMIT_S, NO_MANOEUVRES),
-        Estimate1D(yaw, float(sigma[YAW])).limited(YAW_LIMIT_RAD, NO_MANOEUVRES),
+        along_axes(turned_by.as_rotvec(), sigma[TURN], TURN_LIMITS_RAD, NO_MANOEUVRES),
         Estimate1D(scale, float(sigma[SCALE])).limited(SCALE_LIMIT, NO_MANOEUVRES),
-        along_axes(lever, sigma[LEVER], LEVER_LIMIT_M),
-        along_axes(gyro_bias, sigma[GYRO_BIAS], GYRO_BIAS_LIMIT_RAD_S),
+        along_axes(lever, sigma[LEVER], LEVER_LIMIT_M, NO_TURNS),
+        along_axes(gyro_bias, sigma[GYRO_BIAS], GYRO_BIAS_LIMIT_RAD_S, NO_TURNS),
     )
 
 
