@@ -21,11 +21,11 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 
 # Calls for each sonar frame. To accept a new number, write the measured one here.
 ACCEPTED = {
-    "dead-reckoning": 138.9,
-    "ekf-slam": 106.3,
-    "invariant-ekf": 151.1,
+    "dead-reckoning": 141.5,
+    "ekf-slam": 75.8,
+    "invariant-ekf": 100.4,
     # sightings that share a factor are linearised by a call: more calls in a short run, less time in a long one
-    "isam2": 278.0,
+    "isam2": 283.6,
 }
 MOST_GROWTH = 1.1
 """A count may grow by a tenth."""
