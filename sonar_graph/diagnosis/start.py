@@ -7,7 +7,6 @@ Roll and pitch at the start come from a rest or, if the vehicle moves there, fro
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
@@ -160,7 +159,7 @@ def bias_findings(
 
 
 def turned_mounting(
-    mounting: Mounting, turn_rad: ArrayLike
+    mounting: Mounting, turn_rad: Floats | tuple[float, float, float]
 ) -> tuple[float, float, float]:
     """Roll, pitch and yaw of a mounting after a turn, a rotation vector along the body's axes, shape (3,)."""
     before = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
