@@ -219,7 +219,9 @@ class ImuCalibration(Section):
     accel_noise_density: NotNegative = 1.2e-3
     """White noise of specific force, m/s²/√Hz."""
     accel_bias_sigma: NotNegative = 1e-2
-    """Bias of specific force, m/s²."""
+    """Bias of specific force left when the run starts, m/s²."""
+    accel_bias_m_s2: Vector = (0.0, 0.0, 0.0)
+    """Bias that is known, in the IMU's axes: every estimator takes it from the rows."""
     accel_bias_walk_density: NotNegative = 2e-4
     """Random walk of that bias, m/s³/√Hz."""
     turn_sigma_rad_s: Sigmas = (0.05, 0.05, 0.15)

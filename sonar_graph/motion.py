@@ -163,7 +163,7 @@ class MotionSource(Protocol):
         """Depth samples that a vehicle can have measured, None without any; the others are `refused`."""
 
     def start_by(self, until_ns: int) -> int | None:
-        """First epoch, if it is reached at an instant; else None."""
+        """First epoch, where the start pose holds, if it is reached at an instant; else None."""
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""

@@ -30,6 +30,7 @@ from sonar_graph.measurements import (
 )
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import (
     GaussianKernel,
     Isam2,
@@ -388,3 +389,26 @@ def test_dead_reckoning_names_the_headings_and_fixes_that_it_does_not_use():
     bare = made(DeadReckoning, winding().calibration)
     run(bare, winding(), 3.7)
     assert bare.withheld() == []
+
+
+@pytest.mark.parametrize("kind", [DeadReckoning, EkfSlam, InvariantEkf, Isam2])
+def test_the_start_pose_holds_where_the_imu_begins_between_two_velocities(kind):
+    """Not at the next row of a slow Doppler log, a third of a metre later; however the log is cut into calls."""
+    whole = simulate_mission(MissionOptions(seed=2, duration_s=20.0, landmarks=6))
+    dvl = whole.dvl.rows(slice(None, None, 7))
+    imu = whole.imu.rows(whole.imu.stamps_ns >= dvl.stamps_ns[0] + 300_000_000)
+    pose = whole.true_poses.at(imu.stamps_ns[:1])
+    yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
+    start = Start(position_m=tuple(pose.positions[0]), rpy_rad=(roll, pitch, yaw))
+    calibration = whole.calibration.model_copy(update={"start": start})
+    cut = replace(whole, imu=imu, dvl=dvl, calibration=calibration)
+    assert cut.start_ns == imu.stamps_ns[0]
+    ends = []
+    for rate_hz in (0.7, 5.0):
+        estimator = made(kind, calibration)
+        for window in cut.replay(cut.instants(rate_hz)):
+            estimator.process(window)
+        ends.append(estimator.trajectory().at(imu.stamps_ns[1500:1501]).positions[0])
+    truth = whole.true_poses.at(imu.stamps_ns[1500:1501]).positions[0]
+    assert np.linalg.norm(ends[0] - truth) < 0.1
+    np.testing.assert_allclose(ends[0], ends[1], atol=0.02)

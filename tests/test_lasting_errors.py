@@ -134,14 +134,20 @@ def test_the_scale_lengthens_the_way_of_the_doppler_log():
     assert np.abs(moved[3:] - level @ moved[3:]).max() > 0.1
     bias = np.array([0.01, -0.02, 0.03])
     sequence = turning(known(), scale=0.05)
-    imu = sequence.calibration.imu.model_copy(update={"gyro_bias_rad_s": tuple(bias)})
+    biases = {"gyro_bias_rad_s": tuple(bias), "accel_bias_m_s2": tuple(10.0 * bias)}
+    imu = sequence.calibration.imu.model_copy(update=biases)
     dvl = sequence.calibration.dvl.model_copy(update={"scale_error": 0.05})
     told = sequence.calibration.model_copy(update={"imu": imu, "dvl": dvl})
     biased = replace(
-        sequence.imu, angular_velocity=sequence.imu.angular_velocity + bias
+        sequence.imu,
+        angular_velocity=sequence.imu.angular_velocity + bias,
+        specific_force=sequence.imu.specific_force + 10.0 * bias,
     )
     found = motion_of(replace(sequence, calibration=told, imu=biased))
     assert found.i_T_j.equals(exact.i_T_j, 1e-9)
+    np.testing.assert_allclose(
+        found.mean_specific_force, exact.mean_specific_force, atol=1e-9
+    )
     assert not motion_of(replace(sequence, imu=biased)).i_T_j.equals(exact.i_T_j, 1e-2)
 
 

@@ -117,6 +117,10 @@ def bias_of_yaw_rate(log: Log, rad_s: float) -> None:
     log.rate[:, 2] += rad_s
 
 
+def bias_of_force(log: Log, m_s2: float) -> None:
+    log.force[:, 0] += m_s2
+
+
 def scale_ranges(log: Log, factor: float) -> None:
     log.sightings = [(ids, r * factor, a) for ids, r, a in log.sightings]
 
@@ -260,6 +264,7 @@ def of_specific_force() -> Iterator[Fault]:
     yield row(SENSE, "x and y exchanged", AGAIN, turned("force", X_Y), force)
     yield row("unit", "g, mg, cm/s2", (1 / 9.80665, 1e3 / 9.80665, 1e2), scaled("force"), force)
     yield row("scale", "factor", (1.05, 1.25, 0.8), scaled("force"), force)
+    yield row("scale", "bias of x, m/s2", (0.1, 0.3, -0.5), bias_of_force, r"accelerometer bias|start (roll|pitch): value")
     yield row("marked invalid", "share, -1 as covariance", SHARES, Marked("force", "imu_s", "force", True), LEFT_OUT)
     yield row("marked invalid", "share, NaN", SHARES, Marked("force", "imu_s", "force", False), LEFT_OUT)
 

@@ -77,7 +77,8 @@ class BodyMotion:
         imu = sequence.imu
         body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
         unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
-        force = filled(imu.specific_force) @ body_R_imu.T
+        force = filled(imu.specific_force) - calibration.imu.accel_bias_m_s2
+        force = force @ body_R_imu.T
         path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, force))
         t = path.since_origin(dvl.stamps_ns)  # (n,)
         rows = path.covers(t) & np.isfinite(dvl.velocity).all(axis=1)

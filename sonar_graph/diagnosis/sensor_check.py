@@ -70,6 +70,7 @@ from sonar_graph.diagnosis.start import (
     LEAST_HEADING_RAD,
     NO_GRAVITY,
     StartTilt,
+    accel_bias_findings,
     acting_bias,
     bias_findings,
     find_start_heading,
@@ -230,6 +231,9 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if leaning:
         axes += leaning
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
+    tilting, unbiased = accel_bias_findings(match, sequence.calibration)
+    axes += tilting
+    sequence = replace(sequence, calibration=unbiased)
     is_turned = any(finding.quantity == YAW for finding in axes)
     x, y, z = (
         replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias

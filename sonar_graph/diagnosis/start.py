@@ -14,6 +14,7 @@ from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     NO_NEED,
     Finding,
+    Gravity,
     in_degrees,
     judged,
     matters,
@@ -47,6 +48,10 @@ LARGE_TURN_RAD = np.radians(10.0)
 AXES = "xyz"
 ARM = "lever arm from IMU to DVL"
 BIAS = "gyro bias"
+ACCEL_BIAS = "accelerometer bias"
+LEAST_ACCEL_BIAS_M_S2 = 0.05
+LARGE_ACCEL_BIAS_M_S2 = 0.15
+"""Beyond it gravity is tilted by a degree."""
 NO_GRAVITY = "no gravity in the specific forces"
 
 
@@ -104,6 +109,37 @@ def without_bias(imu: Imu, calibration: Calibration) -> Imu:
     return replace(imu, angular_velocity=unbiased)
 
 
+def accel_bias_findings(
+    found: DvlMatch, calibration: Calibration
+) -> tuple[list[Finding], Calibration]:
+    """A row for each axis on which the accelerometers' bias is beyond its sigma, and the calibration with it."""
+    imu = calibration.imu
+    allowed = imu.accel_bias_sigma
+    if not any(matters(b, LEAST_ACCEL_BIAS_M_S2, allowed) for b in found.accel_bias):
+        return [], calibration
+    in_body = [one.value if one.is_known else 0.0 for one in found.accel_bias]
+    body_R_imu = imu.mounting.pose().rotation().matrix()
+    whole = np.add(imu.accel_bias_m_s2, body_R_imu.T @ in_body)
+    line = f"`imu.accel_bias_m_s2 = {numbers(whole, 3)}` {IN_CALIBRATION}"
+    rows = [
+        Finding(
+            f"{ACCEL_BIAS}, {axis}",
+            one,
+            "m/s²",
+            f"from the turns of the drive, beyond the calibration's sigma of {allowed:.2g}: it tilts gravity by "
+            f"{np.degrees(abs(one.value) / calibration.gravity_m_s2):.2g}°",
+            line=line,
+            gravity=Gravity.GRAVE
+            if abs(one.value) > LARGE_ACCEL_BIAS_M_S2
+            else Gravity.ACT,
+        )
+        for axis, one in zip(AXES, found.accel_bias, strict=True)
+        if matters(one, LEAST_ACCEL_BIAS_M_S2, allowed)
+    ]
+    known = imu.model_copy(update={"accel_bias_m_s2": tuple(whole.tolist())})
+    return said_once(rows), calibration.model_copy(update={"imu": known})
+
+
 def acting_bias(bias: Estimates3D, imu: ImuCalibration) -> list[Estimate1D]:
     """Biases along the axes of the body that the calibration does not allow; zero, and sure, along the other axes."""
     none = Estimate1D(0.0, 0.0)
@@ -148,8 +184,11 @@ def bias_findings(
     for axis, estimate, source in zip(AXES, bias, sources, strict=True):
         cause = f"{source}, beyond the calibration's sigma of {allowed:.2g}"
         row = Finding(f"{BIAS}, {axis}", estimate, "rad/s", cause, line=line)
+        sigma = float(np.hypot(allowed, estimate.sigma))
+        is_doubted = abs(estimate.value) > 2.0 * sigma
+        judgement = "is not surely exceeded" if is_doubted else "allows it"
         fits = (
-            f"{source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
+            f"{source}; the calibration's sigma of {allowed:.2g} {judgement}, {NO_NEED}"
         )
         least = LEAST_BIAS_RAD_S
         rows.append(

@@ -81,7 +81,8 @@ class FirstPath:
         C = running_rotations((rate[1:] + rate[:-1]) / 2 * dt)
         # turns are counted from the start on
         C = C[np.searchsorted(t, 0.0, side="right") - 1].T @ C
-        force = np.einsum("nij,nj->ni", C, imu.specific_force[rows] @ body_R_imu.T)
+        unbiased = imu.specific_force[rows] - calibration.imu.accel_bias_m_s2
+        force = np.einsum("nij,nj->ni", C, unbiased @ body_R_imu.T)
         seconds = (dvl.stamps_ns - start_ns) * 1e-9
         is_inside = (
             (seconds >= 0) & (seconds <= t[-1]) & np.isfinite(dvl.velocity).all(axis=1)

@@ -167,20 +167,48 @@ class Odometry:
         self._dvl.forget_before(needed_ns)
 
     def start_by(self, until_ns: int) -> int | None:
-        """First epoch, if it is reached at an instant: IMU rows cover it, and its velocity is confirmed; else None."""
+        """First epoch, if it is reached at an instant: IMU rows cover it, and its velocity is confirmed; else None.
+
+        It is the first instant with both sensors, where the start pose holds. Where the IMU begins between two rows of the
+        Doppler log, its first row becomes an epoch.
+        """
         imu_ns = self._imu.stamps_ns
         dvl_ns = self._dvl.stamps_ns
         if not len(imu_ns):
             return None
-        covered = dvl_ns[np.searchsorted(dvl_ns, imu_ns[0]) :]
-        if not len(covered) or covered[0] > imu_ns[-1]:
+        first = int(dvl_ns.searchsorted(imu_ns[0]))
+        if first == len(dvl_ns) or dvl_ns[first] > imu_ns[-1]:
             return None
-        first_ns = int(covered[0])
+        first_ns = int(dvl_ns[first])
         # a clock that was set after the first rows of the IMU
         if first_ns - imu_ns[0] > PAUSE_NS:
             self._intake.refuse_imu_before(first_ns - PAUSE_NS)
             return self.start_by(until_ns)
-        return first_ns if self.reached_ns(first_ns) <= until_ns else None
+        if self.reached_ns(first_ns) > until_ns:
+            return None
+        begin_ns = int(imu_ns[0])
+        if first == 0 or begin_ns == first_ns:
+            return first_ns
+        self._add_epoch(begin_ns, first)
+        return begin_ns
+
+    def _add_epoch(self, epoch_ns: int, after: int) -> None:
+        """Add an epoch before a row of the Doppler log, with the velocity between that row and the one before it."""
+        dvl_ns = self._dvl.stamps_ns
+        velocity, cov, known_ns = self._dvl.values
+        before = after - 1
+        share = float((epoch_ns - dvl_ns[before]) / (dvl_ns[after] - dvl_ns[before]))
+        # a held velocity is that until the stamp of its row
+        share = 1.0 if self._hold_past else share
+        between = (1.0 - share) * velocity[before] + share * velocity[after]
+        spread = (1.0 - share) ** 2 * cov[before] + share**2 * cov[after]
+        # between two known velocities the random walk is a Brownian bridge
+        duration_s = (dvl_ns[after] - dvl_ns[before]) * 1e-9
+        q = self.calibration.dvl.velocity_walk_density
+        spread += q**2 * share * (1.0 - share) * duration_s * np.eye(3)
+        known = known_ns[after : after + 1].copy()
+        self._dvl.insert(np.array([epoch_ns]), between[None], spread[None], known)
+        self._kept = None
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Start
+from sonar_graph.calibration import Calibration, Mounting, Start
 from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
@@ -135,6 +135,34 @@ def test_a_stated_start_shows_which_is_rolled_or_pitched(
     turned = {"x": roll, "y": pitch}[axis]
     assert turned == pytest.approx(angle_rad, abs=0.02)
     assert abs(roll) + abs(pitch) + abs(yaw) - abs(turned) < 0.04
+
+
+@pytest.mark.parametrize("bias_m_s2", [(0.1, 0.0, 0.0), (0.0, -0.4, 0.0)])
+def test_a_bias_of_the_accelerometers_is_told_from_gravity_as_the_vehicle_turns(
+    bias_m_s2: tuple[float, float, float],
+) -> None:
+    """Its line, in the axes of an IMU that is turned on the vehicle, takes it away for all that follows."""
+    run = swaying()
+    body_R_imu = Rotation.from_euler("z", 0.5)
+    imu = run.calibration.imu.model_copy(
+        update={"mounting": Mounting(rpy_rad=(0.0, 0.0, 0.5))}
+    )
+    force = body_R_imu.inv().apply(run.imu.specific_force) + bias_m_s2
+    rate = body_R_imu.inv().apply(run.imu.angular_velocity)
+    biased = replace(
+        run,
+        imu=Imu(run.imu.stamps_ns, rate, force),
+        calibration=run.calibration.model_copy(update={"imu": imu}),
+    )
+    found = [f for f in check_sensors(biased) if f.acts]
+    assert {f.quantity[:18] for f in found} == {"accelerometer bias"}
+    known = line_of(found[0])["imu"]["accel_bias_m_s2"]
+    assert known == pytest.approx(bias_m_s2, abs=0.01)
+    right = imu.model_copy(update={"accel_bias_m_s2": tuple(known)})
+    mended = replace(
+        biased, calibration=run.calibration.model_copy(update={"imu": right})
+    )
+    assert not [f for f in check_sensors(mended) if f.acts]
 
 
 def test_mountings_that_are_right_within_two_degrees_are_left_alone() -> None:

@@ -88,7 +88,7 @@ def earth_up_and_level(calibration: Calibration) -> tuple[float, float]:
 
 
 def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
-    """Turn readings into body axes; raises AlignmentError where a specific force was not measured."""
+    """Readings in body axes, forces without their known bias; AlignmentError where a specific force was not measured."""
     if not np.isfinite(imu.specific_force).all():
         raise AlignmentError(
             "Imu.specific_force: is not finite in every row; alignment needs accelerometers throughout"
@@ -97,7 +97,7 @@ def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
     return Imu(
         imu.stamps_ns,
         imu.angular_velocity @ body_R_imu.T,
-        imu.specific_force @ body_R_imu.T,
+        (imu.specific_force - calibration.imu.accel_bias_m_s2) @ body_R_imu.T,
     )
 
 

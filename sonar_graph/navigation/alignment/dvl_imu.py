@@ -159,6 +159,7 @@ PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] *
 SCALE = 1
 TURN = slice(2, 5)
 LEVER = slice(5, 8)
+ACCEL_BIAS = slice(8, 11)
 GYRO_BIAS = slice(11, 14)
 LARGEST_STEP_LEFT = 0.01
 """Of turn (rad), scale, gyro bias over a stretch (rad) and lever arm times a usual rate (m/s): below it, linearising
@@ -175,6 +176,7 @@ TURN_LIMITS_RAD = np.radians([1.0, 1.0, 2.0])
 """About x and y the prior must not decide."""
 SCALE_LIMIT = 0.02
 LEVER_LIMIT_M = 0.25
+ACCEL_BIAS_LIMIT_M_S2 = 0.05
 GYRO_BIAS_LIMIT_RAD_S = 5e-3
 NO_MANOEUVRES = "too little acceleration"
 NO_TURNS = "too little turning"
@@ -184,7 +186,7 @@ Estimates3D = tuple[Estimate1D, Estimate1D, Estimate1D]
 
 @dataclass(frozen=True)
 class DvlMatch:
-    """Corrections to a Doppler log's stamps, mounting and scale, and the gyros' bias."""
+    """Corrections to a Doppler log's stamps, mounting and scale, and the biases of the IMU."""
 
     offset: Estimate1D
     """To be added to the log's stamps, s."""
@@ -194,6 +196,8 @@ class DvlMatch:
     """Factor by which the log's velocities must be multiplied."""
     lever: Estimates3D
     """From the IMU to the log, body axes, m: the whole arm, not a correction."""
+    accel_bias: Estimates3D
+    """Body axes, m/s², beyond the calibration's; a vehicle that does not turn takes it for gravity."""
     gyro_bias: Estimates3D
     """Body axes, rad/s; includes the Earth's rotation along an axis that keeps its direction."""
 
@@ -202,7 +206,7 @@ class DvlMatch:
         """Nothing is known, for one reason."""
         nothing = Estimate1D(np.nan, np.inf, reason)
         along_axes = (nothing,) * 3
-        return cls(nothing, along_axes, nothing, along_axes, along_axes)
+        return cls(nothing, along_axes, nothing, along_axes, along_axes, along_axes)
 
 
 def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
@@ -292,6 +296,9 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
         along_axes(turned_by.as_rotvec(), sigma[TURN], TURN_LIMITS_RAD, NO_MANOEUVRES),
         Estimate1D(scale, float(sigma[SCALE])).limited(SCALE_LIMIT, NO_MANOEUVRES),
         along_axes(lever, sigma[LEVER], LEVER_LIMIT_M, NO_TURNS),
+        along_axes(
+            parameters[ACCEL_BIAS], sigma[ACCEL_BIAS], ACCEL_BIAS_LIMIT_M_S2, NO_TURNS
+        ),
         along_axes(gyro_bias, sigma[GYRO_BIAS], GYRO_BIAS_LIMIT_RAD_S, NO_TURNS),
     )
 

@@ -62,6 +62,8 @@ class RowIntake:
         self._body_R_dvl = _rotation(calibration.dvl.mounting)
         gyro_bias = np.array(calibration.imu.gyro_bias_rad_s)
         self._gyro_bias = gyro_bias if gyro_bias.any() else None
+        accel_bias = np.array(calibration.imu.accel_bias_m_s2)
+        self._accel_bias = accel_bias if accel_bias.any() else None
         self._scale = 1.0 + calibration.dvl.scale_error
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
         self._depth_gate = DepthGate(calibration)
@@ -104,9 +106,11 @@ class RowIntake:
             rows = rows.rows(is_used)
             rate = rate[is_used]
             force = force[is_used]
-        # the calibration's bias is along the sensor's axes
+        # the calibration's biases are along the sensor's axes
         if self._gyro_bias is not None:
             rate = rate - self._gyro_bias
+        if self._accel_bias is not None:
+            force = force - self._accel_bias
         if self._body_R_imu is not None:
             rate = _turned(self._body_R_imu, rate)
             force = _turned(self._body_R_imu, force)
