@@ -397,6 +397,8 @@ class KnownMap(Section):
     """True: estimators count the map's covariance, and report its landmarks as they were given."""
     source: str = ""
     """Origin of the map: a survey, or log and estimator of an earlier run."""
+    has_own_world: bool = False
+    """True: position and heading of its world are those of a vehicle at the start of a dive, which nothing else has."""
     moved: tuple[int, ...] = ()
     """Landmarks that are left out because they have moved: estimators name them, and map them again."""
 

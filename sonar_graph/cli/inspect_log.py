@@ -50,7 +50,7 @@ def inspect(
         bool,
         typer.Option(
             "--quick",
-            help="Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise): seconds.",
+            help="Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise, map): seconds.",
         ),
     ] = False,
     as_json: Annotated[
@@ -64,14 +64,21 @@ def inspect(
     """
     from sonar_graph.files import strict_json
     from sonar_graph.logs import inspect_log
+    from sonar_graph.map_file import read_map
 
     config = reading.config
     given = reading.given
+    if reading.map is not None:
+        # what a run would refuse is refused here too
+        read_map(reading.map)
     # stamps and types alone, without the numbers in the messages: seconds for a large log
     summary = inspect_log(log, config, reading.choices, reading.window, given)
     if toml:
         echo(summary.toml, nl=False)
         return
+    if reading.map is not None:
+        # the converter's words about a start by convention
+        summary.notes.pop("log.start", None)
     findings: list[Finding] = []
     grave: set[str] = set()
     skipped = ""
@@ -83,6 +90,8 @@ def inspect(
     )
     if quick:
         skipped = "not compared: --quick"
+        if reading.map is not None:
+            skipped += ", which leaves out the map too"
     elif summary.obstacles:
         skipped = f"not compared: {', '.join(summary.obstacles)}"
     else:

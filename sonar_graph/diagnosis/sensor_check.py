@@ -907,8 +907,8 @@ def reference_findings(
     )
     yield judged(jump, found.start_heading, LEAST_HEADING_RAD)
     heading = None
-    # a start that is found in the map has no heading yet
-    if offset.is_known and start != Start() and start.source != "map":
+    # a start that is found in the map, or that defines the world, has no heading that could be wrong
+    if offset.is_known and start != Start() and start.source not in ("map", "vehicle"):
         heading = find_start_heading(right, reference, offset)
     # rows on the start must not contradict each other
     is_wrong = heading is not None and heading.acts

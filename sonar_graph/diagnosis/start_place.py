@@ -18,8 +18,11 @@ import numpy as np
 from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     IN_CALIBRATION,
+    NO_NEED,
     Finding,
+    Gravity,
     contradiction,
+    in_degrees,
     numbers,
     unknown,
 )
@@ -84,8 +87,21 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         )
         return
     if fit.is_checked and fit.start is None:
-        why = "the sightings give no single place in the map: it is of another place, landmarks moved, or stand in a row"
-        yield Finding("map: places", unknown(why))
+        yield Finding(
+            "map: places",
+            unknown("they fit nowhere"),
+            cause="the sightings give no single place in it: a map of another place, or landmarks moved, or stand in a row",
+            line="give the map of this place, or none",
+            gravity=Gravity.ACT,
+        )
+    if fit.start is not None:
+        turn = Estimate1D(
+            wrap_angle(fit.start.parameters[0]),
+            float(np.sqrt(fit.start.covariance[0, 0])),
+        )
+        agreeing = [known.ids[row] for row in fit.start.agreeing]
+        fits = f"the sightings of landmarks {listed(agreeing)} fit the map, {NO_NEED}"
+        yield Finding("map: yaw of the start in it", in_degrees(turn), "°", fits)
     start = right.calibration.start
     if fit.start is None or start.source == "map":
         return

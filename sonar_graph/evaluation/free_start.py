@@ -36,8 +36,11 @@ def free_start(calibration: Calibration) -> tuple[bool, bool]:
     if "start" not in calibration.model_fields_set:
         return True, True
     start = calibration.start
-    # a map states the world
-    if start.source not in ("stated", "map"):
+    if start.source == "map":
+        # a map states the world, but for one that a dive without a stated start has made
+        has_own_world = calibration.map is not None and calibration.map.has_own_world
+        return has_own_world, has_own_world
+    if start.source != "stated":
         return start.source == "vehicle", start.source != "fixes"
     said = start.model_fields_set
     return False, "rpy_rad" in said and "position_m" not in said

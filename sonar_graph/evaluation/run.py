@@ -39,6 +39,7 @@ from sonar_graph.estimator import (
     returned_estimate,
     withheld_of,
 )
+from sonar_graph.evaluation.free_start import free_start
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import kept_map_instants
 from sonar_graph.files import KilledError, OwnProcess, Tell, noticed_interrupts, serve
@@ -564,10 +565,14 @@ class _Replay:
         with contextlib.suppress(SonarGraphError):
             known = known_map_of(estimator)
             source = f"{map_origin(self._sequence)}, {self._name}"
-            given = self._sequence.calibration.map
+            calibration = self._sequence.calibration
+            given = calibration.map
+            has_own_world = free_start(calibration)[1]
             if given is not None:
                 source += f", in the map of {given.source or 'no stated source'}"
-            return known.model_copy(update={"source": source})
+                has_own_world = given.has_own_world
+            origin = {"source": source, "has_own_world": has_own_world}
+            return known.model_copy(update=origin)
         return None
 
     def _refused(self, estimator: Estimator) -> list[RefusedRow]:

@@ -100,15 +100,18 @@ def map_fit(sequence: Sequence) -> MapFit:
         if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
+    # of a map with other axes a few landmarks fit somewhere, and some of the others in pairs
+    before = agreeing(given)
+    for mistake, T in MISTAKES.items():
+        corrected = followed(sequence, undone(known, T))
+        is_better = fits(corrected.newest(), corrected.map)
+        if is_better and agreeing(corrected) > before:
+            return MapFit(None, mistake, remedy_of(known, T))
     swaps = exchanged_identities(given.sightings, known)
     if swaps:
         return MapFit(None, *of_swaps(swaps))
     if start is not None:
         return MapFit(start)
-    for mistake, T in MISTAKES.items():
-        corrected = followed(sequence, undone(known, T))
-        if fits(corrected.newest(), corrected.map):
-            return MapFit(None, mistake, remedy_of(known, T))
     looser = known.model_copy(
         update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
     )
@@ -205,6 +208,13 @@ def evidence(locator: MapLocator) -> float:
     newest = locator.newest()
     starts = candidates(map_data(newest, locator.map)) if newest else []
     return starts[0].log_evidence if starts else -math.inf
+
+
+def agreeing(locator: MapLocator) -> int:
+    """Number of landmarks that agree with the best start."""
+    newest = locator.newest()
+    starts = candidates(map_data(newest, locator.map)) if newest else []
+    return len(starts[0].agreeing) if starts else 0
 
 
 def shown(locator: MapLocator) -> float:

@@ -21,9 +21,9 @@ that was seen once is a wrong identity, or new: with v the share of the sighting
 same way again. The vehicle is located when the best start outweighs all others together, and (3), by `ODDS`, and when its
 heading is known well enough to linearise at it.
 
-Landmarks that stand elsewhere have moved: the estimator gets the map without them. Some of them may also agree at a wrong
-start. For `WATCHED_S` after the first start all sightings are therefore weighed again: where a start outweighs the one in
-use by `ODDS`, the estimator begins again.
+Landmarks that stand elsewhere have moved: the estimator gets the map without them. Where they are as many as those that
+agree, the place is none. Some of them may also agree at a wrong start. For `WATCHED_S` after the first start all sightings
+are therefore weighed again: where a start outweighs the one in use by `ODDS`, the estimator begins again.
 
 Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets", PAMI 9(5), 1987; MacKay, "Information Theory,
 Inference, and Learning Algorithms", 2003, chapter 28 (evidence).
@@ -125,6 +125,8 @@ class MapLocator:
         self.found: FoundStart | None = None
         self.moved: list[int] = []
         """Identities of the landmarks that have moved, by the start that was found."""
+        self._refuted: FoundStart | None = None
+        """Last start from which most landmarks stand elsewhere than in the map."""
         self._calibration = calibration
         self.map = calibration.map
         self._places = np.array(self.map.positions_m)
@@ -152,9 +154,14 @@ class MapLocator:
             data = map_data(of_all, self.map)
             if self.found is not None and not outweighs(best, self.found, data):
                 continue
+            moved = moved_landmarks(best, data)
+            # a few fit a mirror image, or a map of another place, by chance
+            if len(moved) >= len(best.agreeing):
+                self._refuted = best
+                continue
             self.found = best
             self._found_ns.append(stamp_ns)
-            self.moved = [self.map.ids[row] for row in moved_landmarks(best, data)]
+            self.moved = [self.map.ids[row] for row in moved]
 
     def is_watching(self, stamp_ns: int) -> bool:
         """True as long as the start may still change."""
@@ -176,7 +183,14 @@ class MapLocator:
             return f"none of its identities {listed(self.map.ids)} was seen; seen: {listed(self._others)}"
         if seen < 2:
             return (
-                f"{seen} of its landmarks were identified, and at least two are needed"
+                f"{seen} of its landmarks seen, and at least two are needed; with one state the start: position_m and "
+                "rpy_rad under [start] in a file for --calibration"
+            )
+        if self._refuted is not None:
+            agreeing = listed(self.map.ids[row] for row in self._refuted.agreeing)
+            return (
+                f"at the only place that fits landmarks {agreeing}, as many others or more stand elsewhere: other axes, a "
+                "map of another place, or most landmarks moved; `sonar-graph inspect LOG --map FILE` looks for its mistake"
             )
         return (
             f"of its landmarks {seen} were identified, and no place explains them {ODDS:g} times better than all others "
