@@ -115,7 +115,7 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         # spreadsheets of some countries write semicolons
         apart = "; separate them by commas" if ";" in text.partition("\n")[0] else ""
         raise LogError(
-            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads)}{apart}"
+            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}{apart}"
         )
     ids: list[int] = []
     places: list[list[float]] = []
@@ -129,9 +129,8 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
             except (TypeError, ValueError):
                 value = math.nan
             if not math.isfinite(value):
-                raise LogError(
-                    f"{where}: {column}: expected a number, not {row[column]!r}"
-                )
+                shown = repr(row[column]) if row[column] else "an empty cell"
+                raise LogError(f"{where}: {column}: expected a number, not {shown}")
             return value
 
         # a table of floats may hold 4.0, and not 4.5
