@@ -586,7 +586,7 @@ BAD = {
     ),
     "empty": (HEAD, "no landmark: give a line for each"),
     "a word": (HEAD + "1,a,2,3,0.1\n", "line 2: x_m: expected a number, not 'a'"),
-    "a short row": (HEAD + "1,2.0\n", "line 2: y_m: expected a number, not None"),
+    "a short row": (HEAD + "1,2.0\n", "line 2: y_m: expected a number, not an empty cell"),
     "twice": (HEAD + "1,0,2,3,0.1\n1,0,2,3,0.1\n", "line 3: landmark 1 stands twice"),
     "an id that no graph has": (
         HEAD + f"{2**56},0,2,3,0.1\n",
