@@ -26,6 +26,7 @@ import numpy as np
 from baselines.events import (
     DEPTH,
     EPOCH,
+    FRAME,
     NO_ROW,
     UNKNOWN,
     Events,
@@ -39,6 +40,7 @@ from baselines.events import (
     is_followed,
     motion_to,
     remove_rate,
+    shows_new,
 )
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
@@ -296,8 +298,8 @@ def update_depth(
 def follow(x: Floats, P: Floats, events: Events, setup: FilterSetup, first: int) -> int:
     """Predict to epochs, update by depths and frames, in turn from one event on; the number of the event that is next.
 
-    It stops before a frame with a new landmark, and after an epoch at which more is measured, or where the Euler angles
-    are singular.
+    It stops before a frame with a new landmark, before an epoch where the Euler angles are singular, and after one at which
+    more is measured.
     """
     order = events.order
     k = first
@@ -308,18 +310,24 @@ def follow(x: Floats, P: Floats, events: Events, setup: FilterSetup, first: int)
             R = rotation_from_euler(x[ROLL], x[PITCH], x[YAW])
             motion = remove_rate(motion, ZERO, R.T @ vec(setup.earth_rad_s))
         row = order.row[k]
+        # its rows are updates by one motion, that to the frame, and new landmarks are none
+        if order.kind[k] == FRAME and shows_new(events.views, row):
+            return k
         if order.kind[k] == EPOCH:
+            # the prediction folds the angles back
+            if k > first and abs(x[PITCH]) >= MOST_PITCH_RAD:
+                return k
             predict(x, P, motion)
             # gravity is compared with the specific force in the frame where its interval began
             feel(setup.felt, motion)
-            if order.has_more[k] or abs(x[PITCH]) >= MOST_PITCH_RAD:
+            if order.has_more[k]:
                 return k + 1
         elif order.kind[k] == DEPTH:
             z_m = events.value[row, 2]
             variance_m2 = events.noise[row, 2, 2]
             update_depth(x, P, motion, setup.port_m, z_m, variance_m2)
-        elif observe(x, P, motion, setup.sonar, events.views, row) != NO_ROW:
-            return k
+        else:
+            observe(x, P, motion, setup.sonar, events.views, row)
         k += 1
     return k
 

@@ -120,6 +120,15 @@ def in_frame(views: Views, first: int) -> Ints:
 
 
 @compiled
+def shows_new(views: Views, first: int) -> bool:
+    """True where a frame, from its first row on, shows a landmark that is not in the state."""
+    for row in in_frame(views, first):  # noqa: SIM110  # numba compiles no generator in any()
+        if views.slot[row] == UNKNOWN:
+            return True
+    return False
+
+
+@compiled
 def read_detections(
     range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats
 ) -> tuple[Floats, Floats]:

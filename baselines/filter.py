@@ -504,6 +504,7 @@ class FilterShell(ABC):
             if events.is_gap[k]:
                 self._bridge(events, k, views)
             kind = kinds[k]
+            self.check(self.node_ns)
             after = self.follow(events, k)
             newest_ns = int(order.start_ns[after])
             if newest_ns > self.node_ns:
@@ -561,7 +562,6 @@ class FilterShell(ABC):
     def _correct_at(self, epoch_ns: int) -> None:
         """Correct at a new epoch by the plane, and by gravity where an interval of it ends."""
         self.node_ns = epoch_ns
-        self.check(epoch_ns)
         if self.calibration.planar is not None:
             self.update_plane(self.calibration.planar)
         if 0 < self._interval_ns <= epoch_ns - self._opened_ns:
@@ -590,16 +590,16 @@ class FilterShell(ABC):
     def _see(self, motion: Motion, views: Views, first: int) -> None:
         """Update by the known landmarks of a frame and append the new ones, in the order of their rows."""
         rows = in_frame(views, first).tolist()
-        if self._may_be_far:
-            for row in rows:
-                self._observe_far(motion, views, row)
-        new = self.observe(motion, views, first)
+        new = first
         while new != NO_ROW:
-            self.augment(motion, views.z[new], views.R_z[new])
-            self._place(views, int(views.ids[new]), self._landmarks)
-            self._landmarks += 1
-            views.outcome[new] = NEW
+            if self._may_be_far:
+                self._observe_far(motion, views, new)
             new = self.observe(motion, views, new)
+            if new != NO_ROW:
+                self.augment(motion, views.z[new], views.R_z[new])
+                self._place(views, int(views.ids[new]), self._landmarks)
+                self._landmarks += 1
+                views.outcome[new] = NEW
         # only landmarks of the map are compared with it
         if self._known.held:
             for row in rows:
@@ -614,14 +614,15 @@ class FilterShell(ABC):
         else:
             self._slots[landmark_id] = slot
 
-    def _observe_far(self, motion: Motion, views: Views, row: int) -> None:
-        """Update by the point seen in a row where its landmark is known and far."""
-        slot = int(views.slot[row])
-        if slot == UNKNOWN:
-            return
-        judged = self.observe_far(motion, slot, views.z[row], views.R_z[row])
-        if judged is not None:
-            views.outcome[row], views.e[row], views.S[row] = judged
+    def _observe_far(self, motion: Motion, views: Views, first: int) -> None:
+        """Update by the points seen of known landmarks that are far, from a row of a frame on to the next new one."""
+        for row in in_frame(views, first).tolist():
+            slot = int(views.slot[row])
+            if slot == UNKNOWN:
+                return
+            judged = self.observe_far(motion, slot, views.z[row], views.R_z[row])
+            if judged is not None:
+                views.outcome[row], views.e[row], views.S[row] = judged
 
     def _gate(self, landmark_id: int) -> float:
         """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map."""

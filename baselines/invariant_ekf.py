@@ -50,6 +50,7 @@ from pydantic import Field
 from baselines.events import (
     DEPTH,
     EPOCH,
+    FRAME,
     NO_ROW,
     UNKNOWN,
     Events,
@@ -63,6 +64,7 @@ from baselines.events import (
     is_followed,
     motion_to,
     remove_rate,
+    shows_new,
 )
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
@@ -319,6 +321,9 @@ def follow(
             bias = gyro_bias_of(state.bias, up)
             motion = remove_rate(motion, bias, R.T @ vec(setup.earth_rad_s))
         row = order.row[k]
+        # its rows are updates by one motion, that to the frame, and new landmarks are none
+        if order.kind[k] == FRAME and shows_new(events.views, row):
+            return k
         if order.kind[k] == EPOCH:
             duration_s = (order.end_ns[k] - order.start_ns[k]) * 1e-9
             predict(state, motion, setup.walk_density**2 * duration_s)
@@ -330,8 +335,8 @@ def follow(
             z_m = events.value[row, 2]
             variance_m2 = events.noise[row, 2, 2]
             update_depth(state, motion, setup.port_m, z_m, variance_m2)
-        elif observe(state, motion, setup.sonar, events.views, row) != NO_ROW:
-            return k
+        else:
+            observe(state, motion, setup.sonar, events.views, row)
         k += 1
     return k
 

@@ -18,8 +18,10 @@ from sonar_graph.models import KnownLandmarks
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_check import exchanged_identities
 from sonar_graph.navigation.map_start import (
+    IdentityWeights,
     MapLocator,
     MapSighting,
+    candidates,
     located,
     map_data,
     moved_landmarks,
@@ -358,6 +360,40 @@ def test_landmarks_that_stand_elsewhere_have_moved_and_wrong_identities_not():
     assert moved_landmarks(found, map_data(right + moved[:2], known)) == []
 
 
+def test_an_identity_seen_once_is_weighed_by_the_share_of_new_landmarks():
+    """Two of four were seen once, the others four and three times: v = 3 / 8, of which one is the next landmark."""
+    weights = IdentityWeights.of(np.array([1, 1, 4, 3]))
+    b = 0.1 / (0.9 * 3 / 8)
+    np.testing.assert_allclose(np.exp(weights.right), [1.0, 1.0, 0.9, 0.9])
+    np.testing.assert_allclose(np.exp(weights.wrong), [b, b, 0.1, 0.1])
+    np.testing.assert_allclose(np.exp(weights.elsewhere), [1.0 + b, 1.0 + b, 1.0, 1.0])
+    # without another place for them, all landmarks are right or wrong
+    right, wrong, elsewhere = (np.exp(column) for column in weights)
+    np.testing.assert_allclose(right + wrong, elsewhere)
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_wrong_identities_seen_once_delay_a_start_less_than_landmarks_elsewhere(count):
+    """Three landmarks agree; the others are seen once each, or three times each in one place."""
+    rng = np.random.default_rng(8)
+    known = random_map(rng, 3 + count)
+    right = [seen_from_start(known, i) for i in range(3) for _ in range(4)]
+    away = rng.uniform(-50.0, 50.0, (count, 2))
+    once = [MapSighting(3 + k, away[k], SEEN_M2) for k in range(count)]
+
+    def gap(sightings):
+        data = map_data(sightings, known)
+        best = candidates(data)[0]
+        return best.log_evidence - np.sum(data.weights.elsewhere - np.log(data.area_m2))
+
+    alone = gap(right)
+    per_once = (alone - gap(right + once)) / count
+    per_elsewhere = (alone - gap(right + 3 * once)) / count
+    assert per_elsewhere == pytest.approx(np.log(10.0), abs=0.1)
+    assert 0.0 < per_once < 0.6 * per_elsewhere
+    assert located(right + once, known) is not None
+
+
 def first_seen(dive: Sequence, count: int) -> list[int]:
     """Identities of the landmarks that the dive sees first."""
     return list(dict.fromkeys(dive.detections.most_probable()[0].tolist()))[:count]
@@ -586,7 +622,10 @@ BAD = {
     ),
     "empty": (HEAD, "no landmark: give a line for each"),
     "a word": (HEAD + "1,a,2,3,0.1\n", "line 2: x_m: expected a number, not 'a'"),
-    "a short row": (HEAD + "1,2.0\n", "line 2: y_m: expected a number, not an empty cell"),
+    "a short row": (
+        HEAD + "1,2.0\n",
+        "line 2: y_m: expected a number, not an empty cell",
+    ),
     "twice": (HEAD + "1,0,2,3,0.1\n1,0,2,3,0.1\n", "line 3: landmark 1 stands twice"),
     "an id that no graph has": (
         HEAD + f"{2**56},0,2,3,0.1\n",

@@ -213,6 +213,8 @@ def test_a_detection_is_valid_if_its_covariance_is_positive_definite(root, i, j)
             seen(range_azimuth_cov=[scale @ cov @ scale] * 2).are_sound()[0]
         ) == (least > 0)
     assert seen(range_azimuth_cov=np.full((2, 2, 2), np.nan)).are_sound().all()
+    partly = np.array([[0.01, np.nan], [np.nan, 1e-4]])
+    assert seen(range_azimuth_cov=[partly, partly]).are_sound().all()
     for wrong in (
         [[1.0, 0.1], [0.2, 1.0]],
         [[np.inf, 0.0], [0.0, 1.0]],

@@ -86,9 +86,14 @@ class TurnedPair:
             found = find_start_tilt(self.as_if(role))
             if found.tilt is None:
                 return ""
-            tilt_rad = np.array([found.tilt.roll_rad, found.tilt.pitch_rad])
-            off_rad[role] = float(np.linalg.norm(tilt_rad - start.rpy_rad[:2]))
+            roll = wrap_angle(found.tilt.roll_rad - start.rpy_rad[0])
+            pitch = found.tilt.pitch_rad - start.rpy_rad[1]
+            off_rad[role] = float(np.hypot(roll, pitch))
         best, worst = sorted(off_rad, key=off_rad.__getitem__)
+        # a start that is tilted as much as the pair is turned may have been read off a turned IMU
+        is_tilted = np.hypot(*start.rpy_rad[:2]) > 0.5 * np.linalg.norm(self.turn_rad)
+        if best == "dvl" and is_tilted:
+            return ""
         return best if off_rad[best] < NEAR * off_rad[worst] else ""
 
     def is_near_course(self, right: Sequence, motion: BodyMotion) -> bool:

@@ -12,7 +12,13 @@ from numpy.testing import assert_allclose
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import COMPASS, EkfSlam
 from baselines.events import Motion
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Start
+from sonar_graph.calibration import (
+    Calibration,
+    DepthCalibration,
+    DvlCalibration,
+    ImuCalibration,
+    Start,
+)
 from sonar_graph.measurements import Measurements
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Outcome
@@ -29,6 +35,7 @@ from .runs import (
     begun,
     circle,
     circle_calibration,
+    depths,
     dvl,
     estimate_after,
     every_filter,
@@ -187,3 +194,26 @@ def test_ekf_slam_on_filterpy_ends_in_the_same_state(monkeypatch, predicts_by_no
     assert_allclose(
         P / np.outer(sigma, sigma), theirs.P / np.outer(sigma, sigma), atol=1e-8
     )
+
+
+def test_a_pitch_beyond_the_vertical_is_told_before_the_prediction_folds_it_back():
+    """A depth of a port ahead of the body lifts the pitch to 103 degrees in one update."""
+    calibration = Calibration(
+        use_gravity=False,
+        depth=DepthCalibration(port_m=(1.0, 0.0, 0.0), sigma_m=0.01),
+        start=Start(position_sigma_m=(1e-3,) * 3, rpy_sigma_rad=(1e-3, 1.0, 1e-3)),
+    )
+    slam = begun(EkfSlam, calibration)
+    gyro = imu(6, force=NO_FORCE)
+    still = dvl(6)
+    seen = depths(np.array([later(1.3)]), -1.8)
+    slam.process(Measurements(later(1.0), first_of(gyro, 1.0), first_of(still, 1.0)))
+    assert slam.withheld() == []
+    slam.process(Measurements(later(3.0), gyro, still, seen))
+    (told,) = slam.withheld()
+    assert told.startswith("pitch came to 103 deg")
+
+
+def first_of(block, seconds):
+    """Rows of a block up to a time since the start."""
+    return block.rows(block.stamps_ns <= later(seconds))

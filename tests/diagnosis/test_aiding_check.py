@@ -288,6 +288,7 @@ def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(
         (-3000.0, -3.0, True),
         (-50.0, None, False),
         (0.5, None, False),
+        (1.5, None, True),
         (7.7, None, True),
     ],
 )

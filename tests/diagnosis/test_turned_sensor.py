@@ -165,6 +165,24 @@ def test_a_bias_of_the_accelerometers_is_told_from_gravity_as_the_vehicle_turns(
     assert not [f for f in check_sensors(mended) if f.acts]
 
 
+def test_a_turn_about_both_level_axes_has_one_line() -> None:
+    run = with_turned(with_turned(swaying(), "dvl", 0.2, "x"), "dvl", 0.07, "y")
+    (finding,) = acting(run)
+    roll, pitch, _ = line_of(finding)["dvl"]["mounting"]["rpy_rad"]
+    assert [roll, pitch] == pytest.approx([0.2, 0.07], abs=0.02)
+    (small,) = acting(with_turned(swaying(), "dvl", 0.07, "y"))
+    assert small.quantity == "DVL mounting pitch"
+
+
+def test_a_start_that_is_tilted_like_a_turned_imu_decides_nothing() -> None:
+    """It may have been read off that IMU: its gravity fits, and the Doppler log would be blamed."""
+    run = with_turned(swaying(), "imu", 0.2, "x")
+    tilted = run.calibration.start.model_copy(update={"rpy_rad": (-0.2, 0.0, 0.0)})
+    calibration = run.calibration.model_copy(update={"start": tilted})
+    finding, *_ = acting(replace(run, calibration=calibration))
+    assert "no other sensor shows which" in finding.advice
+
+
 def test_mountings_that_are_right_within_two_degrees_are_left_alone() -> None:
     assert acting(swaying()) == []
     assert acting(with_turned(swaying(), "dvl", 0.03, "x")) == []
