@@ -52,7 +52,7 @@ A_MINUTE = np.array([0.0, 0.0, 60.0])
 def match(
     lever: tuple[Estimate1D, ...], bias: tuple[Estimate1D, ...] = (UNKNOWN,) * 3
 ) -> DvlMatch:
-    return DvlMatch(UNKNOWN, UNKNOWN, UNKNOWN, lever, bias)  # type: ignore[arg-type]
+    return DvlMatch(UNKNOWN, UNKNOWN, UNKNOWN, lever, UNKNOWN, bias)  # type: ignore[arg-type]
 
 
 def arm(*values: float, sigma: float = 0.01) -> Any:

@@ -258,6 +258,7 @@ def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
         turn=told(0.0, 0.0, yaw, sigma=1e-5),
         scale=Estimate1D(scale, 1e-5),
         lever=told(-0.2, 0.0, -0.15),
+        accel_bias=told(0.0, 0.0, 0.0),
         gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6),
     )
     turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
@@ -283,7 +284,12 @@ def test_the_bias_of_smaller_sigma_wins_axis_by_axis():
     nothing = told(0.0, 0.0, 0.0)
     x, y, _ = told(1.0, 2.0, 3.0, sigma=1e-4)
     drive = DvlMatch(
-        unknown, unknown, unknown, nothing, (x, replace(y, sigma=1e-2), unknown)
+        unknown,
+        unknown,
+        unknown,
+        nothing,
+        nothing,
+        (x, replace(y, sigma=1e-2), unknown),
     )
     sigmas = np.array([1.0, 1.0, 1e-3, 1e-3, 1e-3])
     rest = InitialTilt(
