@@ -296,6 +296,8 @@ RANDOM = settings(
 )
 # up to a message within an uncompressed chunk
 @example("remove", 0.0, 1449)
+# from one message into another, so that the length of the first fits again
+@example("remove", 0.859375, 1209)
 @pytest.mark.parametrize("compression", [ZSTD, NONE])
 def test_no_damage_makes_up_a_message_or_loses_one_silently(
     path: Path, compression: CompressionType, how: str, part: float, count: int
@@ -315,7 +317,12 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
     path.write_bytes(damaged)
     recording = scan_all(path)
     found = read(path)
-    assert found == [entry for entry in written if entry in set(found)]
+    of_written = [entry for entry in found if entry in set(written)]
+    assert of_written == [entry for entry in written if entry in set(found)]
+    # where lengths fit again nothing shows that bytes are missing, but that no CRC covers them is said
+    if of_written != found:
+        assert len(found) == len(of_written) + 1
+        assert "which no CRC covers" in str(recording.ending)
     if found != written:
         assert recording.corrupt or recording.ending
 
