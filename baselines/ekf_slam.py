@@ -310,7 +310,7 @@ def follow(x: Floats, P: Floats, events: Events, setup: FilterSetup, first: int)
             R = rotation_from_euler(x[ROLL], x[PITCH], x[YAW])
             motion = remove_rate(motion, ZERO, R.T @ vec(setup.earth_rad_s))
         row = order.row[k]
-        # its rows are updates by one motion, that to the frame, and new landmarks are none
+        # the caller appends new landmarks, and takes the whole frame: all its rows have one motion
         if order.kind[k] == FRAME and shows_new(events.views, row):
             return k
         if order.kind[k] == EPOCH:

@@ -35,7 +35,9 @@ from sonar_graph.numerics import (
 EPOCH, DEPTH, HEADING, FIX, FRAME, END = range(6)
 """Kinds of events; at equal stamps the lower comes first."""
 UNKNOWN = -1
+"""In place of the number of a landmark that is not in the state."""
 NO_ROW = -1
+"""In place of a row where there is none."""
 NOT_STARTED = int(np.iinfo(np.int64).max)
 LONG_AGO = int(np.iinfo(np.int64).min)
 

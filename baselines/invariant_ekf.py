@@ -321,7 +321,7 @@ def follow(
             bias = gyro_bias_of(state.bias, up)
             motion = remove_rate(motion, bias, R.T @ vec(setup.earth_rad_s))
         row = order.row[k]
-        # its rows are updates by one motion, that to the frame, and new landmarks are none
+        # the caller appends new landmarks, and takes the whole frame: all its rows have one motion
         if order.kind[k] == FRAME and shows_new(events.views, row):
             return k
         if order.kind[k] == EPOCH:

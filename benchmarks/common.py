@@ -164,7 +164,11 @@ def write_results(
         [
             "python",
             Path(sys.argv[0]).resolve().relative_to(root.parent).as_posix(),
-            *sys.argv[1:],
+            # nobody else has the files and folders of this machine
+            *(
+                Path(word).name if word.startswith("/") else word
+                for word in sys.argv[1:]
+            ),
         ]
     )
     lines = [

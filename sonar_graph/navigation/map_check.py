@@ -1,11 +1,11 @@
 """Check of a known map against the sightings of a log: other identities, axes, units and sigmas, another start.
 
-Where the sightings give no start in the map (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
-that then gives a start, with three or more landmarks, is named. A wrong sign of the heights may leave the start where it
-is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, for which one
-landmark is enough, or where the evidence (2) of the best start is `CLEAR` times as large with it. Two exchanged identities
-are named by the evidence of the map with that exchange undone: a priori each of the n (n - 1) / 2 exchanges is equally
-probable.
+Where no more than half of the landmarks agree with the best start (`map_start`), the map is tried with each mistake of
+`MISTAKES` undone. One with which more landmarks agree, and most of them, is named. A wrong sign of the heights may leave the
+start where it is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, for
+which one landmark is enough, or where the evidence (2) of the best start is `CLEAR` times as large with it. Two exchanged
+identities are named by the evidence of the map with that exchange undone: a priori each of the n (n - 1) / 2 exchanges is
+equally probable.
 """
 
 import math
@@ -102,7 +102,8 @@ def map_fit(sequence: Sequence) -> MapFit:
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
     # of a map with other axes a few landmarks fit somewhere, and some of the others in pairs
     before = agreeing(given)
-    for mistake, T in MISTAKES.items():
+    is_doubted = 2 * before <= len(seen_rows(given))
+    for mistake, T in MISTAKES.items() if is_doubted else ():
         corrected = followed(sequence, undone(known, T))
         is_better = fits(corrected.newest(), corrected.map)
         if is_better and agreeing(corrected) > before:
