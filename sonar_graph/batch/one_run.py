@@ -175,6 +175,7 @@ def measured(comparison: Comparison) -> Row:
         **_versions(comparison.environment),
         "status": run.status,
         "reason": run.reason,
+        "withheld": "; ".join(run.withheld) or None,
     }
     if run.status == "failed":
         # numpy and GTSAM name it differently

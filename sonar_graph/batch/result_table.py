@@ -107,7 +107,15 @@ def metrics_of(keys: list[str]) -> list[Metric]:
 
 
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
-SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
+SETTINGS = (
+    "variant",
+    "params",
+    "estimator",
+    "status",
+    "reason",
+    "withheld",
+    "log_file",
+)
 # notes of the comparison of a log's sensors with each other, as of `sonar-graph compare`
 FINDINGS = ("doubtful", "sensors")
 VERSIONS = (

@@ -122,6 +122,7 @@ def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
         lost_told,
         missing_told,
         sensors_told,
+        withheld_told,
         write_batch_report,
     )
 
@@ -131,6 +132,6 @@ def write_report_of(folder: Path, *, overwrite: bool = False) -> Path:
         page = write_batch_report(batch, folder, overwrite=overwrite)
     for sentence in [*missing_told(batch), *lost_told(batch)]:
         echo(f"Warning: {sentence}", err=True)
-    for sentence in sensors_told(batch):
+    for sentence in [*sensors_told(batch), *withheld_told(batch)]:
         echo(sentence, err=True)
     return page

@@ -6,7 +6,7 @@ from sonar_graph import at_first_use
 
 if TYPE_CHECKING:
     from sonar_graph.report.batch_page import write_batch_report
-    from sonar_graph.report.batch_summary import lost_told, missing_told, sensors_told
+    from sonar_graph.report.batch_summary import lost_told, missing_told, sensors_told, withheld_told
     from sonar_graph.report.comparison_page import write_page, write_report
     from sonar_graph.report.console import summary
     from sonar_graph.report.paper import write_paper
@@ -17,5 +17,5 @@ else:
 
 __all__ = [
     "doubt_lines", "doubtful_lines", "lost_told", "missing_told", "render", "sensors_told", "summary",
-    "write_batch_report", "write_page", "write_paper", "write_report",
+    "withheld_told", "write_batch_report", "write_page", "write_paper", "write_report",
 ]

@@ -134,6 +134,7 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
             *summary.absent_told(batch),
             *summary.failures_told(batch),
             *summary.sensors_told(batch),
+            *summary.withheld_told(batch),
         ],
         "warnings": [
             *summary.reference_told(batch),

@@ -248,6 +248,25 @@ def sensors_told(batch: RecordedBatch) -> list[str]:
     ]
 
 
+def withheld_told(batch: RecordedBatch) -> list[str]:
+    """What estimators did not use, and what moved in a given map: a line for each log and text, grave ones first."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for run in batch.runs:
+        if "withheld" in run.texts:
+            found.setdefault((run.log, run.texts["withheld"]), []).append(
+                run.contestant
+            )
+    lines = [
+        f"Warning: {log}: {', '.join(dict.fromkeys(names))}: {text}"
+        for (log, text), names in found.items()
+    ]
+    lines.sort(key=lambda line: "beyond doubt" not in line)
+    if len(lines) > NAMED:
+        more = f"{len(lines) - NAMED} more in the column `withheld` of results.parquet"
+        return [*lines[:NAMED], more]
+    return lines
+
+
 def absent_told(batch: RecordedBatch) -> list[str]:
     """The logs that were left out because their data was not there, and where it is from."""
     return [

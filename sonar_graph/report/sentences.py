@@ -5,6 +5,7 @@ squared innovations, exceed `ABSURD`; where covariances hold, that has a probabi
 too small it has 1e-9 to the power of 1/f².
 """
 
+import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -28,6 +29,7 @@ from sonar_graph.evaluation import (
     normalised_squares,
     scored_map,
 )
+from sonar_graph.models import MOVED
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, counted, landmark_name
@@ -63,6 +65,7 @@ POLICY = "identity.policy"
 UNKNOWN = "identity.unknown.policy"
 WARNING = "Warning"
 DOUBTFUL = "Doubtful"
+BEYOND = "beyond doubt"
 # ratio of squared innovations to their covariance, typical of a sensor, that no noise makes
 BEYOND_DOUBT = 100.0
 # notes that the terminal shows, and the word before each, causes first; the report has all notes
@@ -533,11 +536,6 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
                 "start or the Doppler log; `sonar-graph inspect` compares them, `use = false` under [depth] in the log "
                 "configuration leaves them out"
             )
-        lines += [
-            f"{DOUBTFUL}: {run.estimator}: {line}"
-            for line in run.withheld
-            if "beyond doubt" in line
-        ]
         if (log := run.detections) is not None:
             used = np.array(
                 [outcome is Outcome.USED for outcome in log.outcomes], dtype=bool
@@ -550,6 +548,11 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
                     f"typically {np.median(ratios):.0f} times what their noise allows: ranges, azimuths, identities or "
                     "the sonar's mounting; `use = false` under [detections] leaves them out"
                 )
+    lines += [
+        f"{DOUBTFUL}: {names}: {message}"
+        for message, names in said_by(comparison).items()
+        if BEYOND in message
+    ]
     return lines
 
 
@@ -579,17 +582,38 @@ def refusal_lines(comparison: Comparison) -> list[str]:
     return lines
 
 
-def withheld_lines(comparison: Comparison) -> list[str]:
-    """Measurements that runs could not use, in their own words: the first ones, and the number of the others."""
-    lines = []
+def said_by(comparison: Comparison, most: int | None = None) -> dict[str, str]:
+    """The first messages of each run about what it could not use, with the names of the runs that say the same."""
+    names: dict[str, list[str]] = {}
     for run in comparison.runs:
-        lines += [
-            f"{WARNING}: {run.estimator}: {message}"
-            for message in run.withheld[:MOST_ROWS_NAMED]
-        ]
+        for message in run.withheld[:most]:
+            names.setdefault(message, []).append(run.estimator)
+    return {message: ", ".join(own) for message, own in names.items()}
+
+
+def withheld_lines(comparison: Comparison) -> list[str]:
+    """What runs could not use, in their own words: the first messages, and the number of the others."""
+    said = said_by(comparison, MOST_ROWS_NAMED)
+    lines = [
+        f"{WARNING}: {names}: {message}"
+        for message, names in said.items()
+        if BEYOND not in message
+    ]
+    for run in comparison.runs:
         more = len(run.withheld) - MOST_ROWS_NAMED
         if more > 0:
             lines.append(
                 f"{WARNING}: {run.estimator} withheld {more} more: comparison.json has all"
+            )
+    calibration = comparison.sequence.calibration
+    start_sigma_m = max(calibration.start.position_sigma_m[:2])
+    is_stated = calibration.start.source != "map"
+    if is_stated and calibration.map and any(MOVED in message for message in said):
+        map_sigma_m = math.sqrt(np.diag(calibration.map.joint()).max())
+        # the first landmark that is seen corrects such a start, and if it is the one that moved, others seem to have moved
+        if start_sigma_m > map_sigma_m:
+            lines.append(
+                f"{WARNING}: the start is less certain ({start_sigma_m:.2g} m) than the map ({map_sigma_m:.2g} m): if it is "
+                'off, the wrong landmarks may count as moved; `source = "map"` under [start] finds it by all landmarks'
             )
     return lines

@@ -13,7 +13,7 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.report import lost_told, missing_told, write_batch_report
 from sonar_graph.report.batch_figures import log_panels
 from sonar_graph.report.batch_page import render_batch
-from sonar_graph.report.batch_summary import absent_told, marked
+from sonar_graph.report.batch_summary import absent_told, marked, withheld_told
 from sonar_graph.report.batch_tables import failure_table
 from sonar_graph.report.figure_style import PAGE_WIDTH_IN, colour, sized
 from tests.recorded_batches import (
@@ -106,6 +106,24 @@ def test_logs_whose_data_was_absent_are_named_with_their_source():
         == absent_told(replace(batch, suite="no toml ["))
         == []
     )
+
+
+def test_what_estimators_withheld_is_told_once_for_each_log():
+    moved, grave = "moved since the map was made: landmark 3", "beyond doubt"
+    drawn = drawn_batch(2)
+    runs = [
+        replace(run, texts=run.texts | {"withheld": grave if run.seed else moved})
+        if run.log == LOGS[0] and run.estimator == "isam2"
+        else run
+        for run in drawn.runs
+    ]
+    batch = replace(drawn, runs=runs)
+    assert withheld_told(batch) == [
+        f"Warning: {LOGS[0]}: isam2: {grave}",
+        f"Warning: {LOGS[0]}: isam2: {moved}",
+    ]
+    assert f"{LOGS[0]}: isam2: {moved}" in render_batch(batch)
+    assert withheld_told(drawn) == []
 
 
 def test_a_table_with_missing_runs_is_read_as_one_in_the_order_of_the_plan(

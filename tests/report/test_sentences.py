@@ -447,6 +447,29 @@ def test_terminal_and_page_list_refused_and_withheld_rows():
     assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: comparison.json has all"
     assert sentences.withheld_lines(calm) == []
+    same = replace(calm, runs=[replace(run, withheld=[WITHHELD]) for run in calm.runs])
+    (line,) = sentences.withheld_lines(same)
+    assert line == f"Warning: {', '.join(r.estimator for r in calm.runs)}: {WITHHELD}"
+
+
+@pytest.mark.parametrize(("start_sigma_m", "count"), [(0.04, 1), (0.06, 2)])
+def test_landmarks_that_moved_are_doubted_where_the_start_is_less_certain_than_the_map(
+    start_sigma_m, count
+):
+    comparison = only(basin_comparison(60), "isam2")
+    known = KnownMap.of([1], [[0.0, 0.0, 0.0]], sigma_m=0.05)
+    given = comparison.sequence.calibration
+    sigmas_m = (start_sigma_m, 0.01, 1.0)
+    start = given.start.model_copy(update={"position_sigma_m": sigmas_m})
+    calibration = given.model_copy(update={"start": start, "map": known})
+    sequence = replace(comparison.sequence, calibration=calibration)
+    moved = replace(
+        comparison.runs[0], withheld=["moved since the map was made: landmark 1"]
+    )
+    comparison = with_run(replace(comparison, sequence=sequence), moved)
+    lines = sentences.withheld_lines(comparison)
+    assert len(lines) == count
+    assert 'source = "map"' in lines[-1] or count == 1
 
 
 def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
