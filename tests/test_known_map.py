@@ -21,6 +21,7 @@ from sonar_graph.navigation.map_start import (
     IdentityWeights,
     MapLocator,
     MapSighting,
+    agreement,
     candidates,
     located,
     map_data,
@@ -280,6 +281,27 @@ def test_a_start_that_is_found_does_not_depend_on_how_the_log_is_cut(dive):
         np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
+def test_landmarks_below_the_aperture_do_not_bend_a_found_start(dive):
+    """A sonar shows what is near beyond its aperture; 4 m away and 2.5 m below, elevation shortens the way by 0.9 m."""
+    start = dive.calibration.start.pose()
+    angles = np.array([-0.5, 0.1, 0.6])
+    ranges_m = np.array([3.5, 5.0, 4.0])
+    level = ranges_m * [np.cos(angles), np.sin(angles)]
+    places = np.array([start.transformFrom(np.array([x, y, -2.5])) for x, y in level.T])
+    seen = in_view(dive, places)
+    narrow = seen.calibration.sonar.model_copy(update={"elevation_aperture_rad": 0.2})
+    calibration = seen.calibration.model_copy(update={"sonar": narrow})
+    known = KnownMap.of(range(3), places, sigma_m=SIGMA_M)
+    lost = with_map(replace(seen, calibration=calibration), known, unknown_start(dive))
+    locator = MapLocator(lost.calibration)
+    for window in lost.replay(seen.detections.stamps_ns[::3]):
+        locator.add(window)
+    assert locator.found is not None
+    _, x, y = locator.found.parameters
+    np.testing.assert_allclose([x, y], start.translation()[:2], atol=0.1)
+    assert not any(sighting.is_in_view for sighting in locator.sightings)
+
+
 def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
     known = surveyed(dive)
     shuffled = np.random.default_rng(3).permutation(known.ids).tolist()
@@ -332,6 +354,19 @@ def test_a_third_landmark_far_from_two_others_agrees_with_their_start():
     assert found is not None
     assert found.agreeing == {0, 1, 2}
     np.testing.assert_allclose(found.parameters[0], 0.0, atol=0.01)
+
+
+def test_the_heading_of_two_landmarks_near_each_other_refutes_no_third():
+    """A sighting agrees with a start by the covariance of both: the start of two landmarks may be turned."""
+    places = np.array([[0.0, 0.0, -4.0], [1.0, 0.0, -4.0], [40.0, 5.0, -4.0]])
+    known = KnownMap.of(range(3), places, sigma_m=0.05)
+    S = np.diag([0.02**2, 0.05**2])
+    data = map_data([MapSighting(i, places[i, :2], S) for i in range(3)], known)
+    turned = np.array([0.05, 0.0, 0.0])
+    _, agreeing = agreement(turned, np.zeros((3, 3)), data)
+    assert agreeing.tolist() == [True, True, False]
+    _, agreeing = agreement(turned, np.diag([0.05**2, 0.0, 0.0]), data)
+    assert agreeing.all()
 
 
 def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):

@@ -231,6 +231,7 @@ class MapLocator:
         o_T_sonar = o_T_body.compose(self._body_T_sonar)
         by_bias = motion.D_bias * self._calibration.imu.gyro_bias_sigma  # (6, 3)
         C = motion.covariance + by_bias @ by_bias.T
+        half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
         for k in rows:
             row = self._rows[int(ids[k])]
             z = np.array([frame.range_m[k], frame.azimuth_rad[k]])
@@ -239,13 +240,14 @@ class MapLocator:
                 float(z[0]),
                 float(z[1]),
                 float(self._places[row, 2]),
-                self._calibration.sonar.elevation_aperture_rad,
+                aperture_rad=2.0 * math.pi,
             )
             point = locate(o_T_sonar, float(z[0]), float(z[1]), elevation_rad or 0.0)
             R_z = frame.range_azimuth_cov[k]
             R_z = self._R_z if np.isnan(R_z).any() else R_z
             S = spread(o_T_body, o_T_sonar, point, R_z, C)
-            is_in_view = elevation_rad is not None
+            # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
+            is_in_view = elevation_rad is not None and abs(elevation_rad) <= half_rad
             self.sightings.append(MapSighting(row, point[:2], S, is_in_view))
         return True
 
@@ -460,9 +462,9 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     """Least squares of (1) over the landmarks that agree, with the evidence (2)."""
     seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
     agreeing = np.zeros(len(seen), bool)
-    information = np.zeros((3, 3))
+    covariance = np.zeros((3, 3))
     for _ in range(STEPS):
-        agrees, agreeing = agreement(parameters, data)
+        agrees, agreeing = agreement(parameters, covariance, data)
         if np.count_nonzero(agreeing) < 2:
             return None
         q, S = mean_sightings(agrees[agreeing], data)  # (a, 2), (a, 2, 2)
@@ -477,9 +479,9 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
         gradient = weighted.T @ e
         step = np.linalg.solve(information, gradient)
         parameters = parameters + step
+        covariance = np.asarray(np.linalg.inv(information), np.float64)
         if float(step @ gradient) < CONVERGED:
             break
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
     _, log_det = np.linalg.slogdet(2.0 * math.pi * W)
     log_density = -0.5 * float(e @ np.linalg.solve(W, e) + log_det)
     wrong = float(np.sum(data.weights.wrong[~agreeing] - math.log(data.area_m2)))
@@ -490,11 +492,17 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
 
 
-def agreement(parameters: Floats, data: MapData) -> tuple[Any, Any]:
+def agreement(
+    parameters: Floats, covariance: Floats, data: MapData
+) -> tuple[Any, Any]:
     """Sightings of each landmark within the ellipse of (1), shape (l, k), and landmarks with most of them, (l,)."""
     R = turn(parameters[0])
     e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)
-    W = R @ data.S @ R.T + data.place_cov[data.rows]  # (k, 2, 2)
+    J = np.tile(np.eye(2, 3, 1), (len(e), 1, 1))  # (k, 2, 3)
+    J[:, :, 0] = data.q @ turn(parameters[0] + 0.5 * math.pi).T
+    # a heading by two landmarks near each other is too uncertain to place a third one far away
+    of_start = J @ covariance @ J.transpose(0, 2, 1)  # (k, 2, 2)
+    W = R @ data.S @ R.T + data.place_cov[data.rows] + of_start  # (k, 2, 2)
     squared = np.einsum("ki,ki->k", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
     agrees = data.is_of & (squared <= AGREES)
     return agrees, 2 * agrees.sum(axis=1) > data.is_of.sum(axis=1)
@@ -511,7 +519,7 @@ def outweighs(best: FoundStart, other: FoundStart, data: MapData) -> bool:
 
 def moved_landmarks(start: FoundStart, data: MapData) -> list[int]:
     """Rows of the landmarks that disagree with a start, and stand elsewhere."""
-    _, agreeing = agreement(start.parameters, data)
+    _, agreeing = agreement(start.parameters, start.covariance, data)
     return [
         int(data.rows[is_of][0])
         for is_of in data.is_of[~agreeing]
