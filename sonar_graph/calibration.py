@@ -438,10 +438,23 @@ class KnownMap(Section):
         P = self.joint()
         # tolerances scale with the map
         largest = float(np.abs(P).max())
+        apart = np.abs(P - P.T)
+        row, column = divmod(int(apart.argmax()), size)
+        eigenvalues, vectors = np.linalg.eigh(P)
+        reason = ""
         # relative to the largest entry: rounding of a text file
-        is_symmetric = bool((np.abs(P - P.T) <= 1e-6 * largest).all())
-        if not is_symmetric or np.linalg.eigvalsh(P)[0] < -1e-9 * largest:
-            reason = "expected a symmetric matrix without negative eigenvalues"
+        if apart[row, column] > 1e-6 * largest:
+            reason = (
+                f"expected a symmetric matrix, not {P[row, column]:g} in row {row + 1}, column {column + 1} and "
+                f"{P[column, row]:g} in row {column + 1}, column {row + 1}"
+            )
+        elif eigenvalues[0] < -1e-9 * largest:
+            suspect = self.ids[int(np.abs(vectors[:, 0]).argmax()) // 3]
+            reason = (
+                f"landmark {suspect}: expected a covariance without negative eigenvalues, such as that of a "
+                "correlation above 1"
+            )
+        if reason:
             raise misfits(type(self), {"covariance_m2": reason})
         return self
 
