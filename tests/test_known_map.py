@@ -720,7 +720,10 @@ def test_a_table_of_a_spreadsheet_with_its_mark_is_read(tmp_path):
     ("covariance", "message"),
     [
         (np.eye(2), "expected 3 rows of 3 numbers"),
-        (np.diag([1.0, 1.0, -1.0]), "landmark 1: expected a covariance without negative"),
+        (
+            np.diag([1.0, 1.0, -1.0]),
+            "landmark 1: expected a covariance without negative",
+        ),
         (
             np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]),
             "expected a symmetric matrix, not 0.5 in row 1, column 2",

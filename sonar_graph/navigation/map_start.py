@@ -492,9 +492,7 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
 
 
-def agreement(
-    parameters: Floats, covariance: Floats, data: MapData
-) -> tuple[Any, Any]:
+def agreement(parameters: Floats, covariance: Floats, data: MapData) -> tuple[Any, Any]:
     """Sightings of each landmark within the ellipse of (1), shape (l, k), and landmarks with most of them, (l,)."""
     R = turn(parameters[0])
     e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)

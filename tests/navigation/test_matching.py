@@ -20,7 +20,7 @@ from sonar_graph.navigation.alignment import (
     match_reference_to_imu,
     stretches_of,
 )
-from sonar_graph.navigation.alignment.dvl_imu import velocity_changes
+from sonar_graph.navigation.alignment.dvl_imu import Averaged, velocity_changes
 from sonar_graph.navigation.alignment.reference_offset import ReferenceMatch
 from sonar_graph.navigation.alignment.time_offset import SampleSeries
 from sonar_graph.sequence import Sequence
@@ -187,8 +187,10 @@ def test_derivatives_are_those_of_what_is_lined_up(
             Imu(imu.stamps_ns, imu.angular_velocity + rate, imu.specific_force + force)
         )
         seconds = path.since_origin(dvl.stamps_ns)[:150]
+        run = Averaged.of(slice(0, 150), seconds)
+        assert run is not None
         return velocity_changes(
-            path, seconds, dvl.velocity[:150], [slice(0, 150)], np.zeros(3), 0.0
+            path, seconds, dvl.velocity[:150], [run], np.zeros(3), 0.0
         )[0]
 
     before = first(np.zeros(3))

@@ -11,6 +11,7 @@ from sonar_graph.navigation.alignment.time_offset import (
     OffsetFit,
     SampleSeries,
     fit,
+    grouped,
     search_offset,
 )
 
@@ -116,7 +117,10 @@ def test_the_ratios_maximise_the_restricted_likelihood():
     tried = [
         np.array(ratios) for ratios in ((0.8, 0.3), (0.2, 0.3), (0.8, 0.02), (3.0, 1.0))
     ]
-    ours = [NormalEquations.of(stretches, ratios).criterion(WIDE) for ratios in tried]
+    ours = [
+        NormalEquations.of(grouped(stretches), ratios).criterion(WIDE)
+        for ratios in tried
+    ]
     assert np.diff(ours) == pytest.approx(
         np.diff([restricted_likelihood(stretches, r) for r in tried]), rel=1e-6
     )

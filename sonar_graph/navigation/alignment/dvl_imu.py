@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +54,8 @@ class InertialPath:
     seconds: Floats
     """Times of the samples since ``origin_ns``, shape (n,)."""
     origin_ns: int
+    turns: Floats
+    """Rotation vector from each sample to the next, shape (n - 1, 3), rad."""
     rotations: Floats
     """C, shape (n, 3, 3)."""
     impulse: Floats
@@ -97,25 +100,24 @@ class InertialPath:
 
     def rotations_at(self, seconds: Floats) -> Floats:
         """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
-        after = np.clip(
-            np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1
-        )
-        share = (seconds - self.seconds[after - 1]) / (
-            self.seconds[after] - self.seconds[after - 1]
-        )
-        before = Rotation.from_matrix(self.rotations[after - 1])
-        step = (before.inv() * Rotation.from_matrix(self.rotations[after])).as_rotvec()
-        return np.asarray(
-            (before * Rotation.from_rotvec(share[:, None] * step)).as_matrix()
-        )
+        row, share = self._between(seconds)
+        since = Rotation.from_rotvec(share[:, None] * self.turns[row]).as_matrix()
+        return np.asarray(self.rotations[row] @ since)
 
     def linear_at(self, seconds: Floats, values: Floats) -> Floats:
         """One of the integrals, or any values at the samples, linear in between, shape (k, ...)."""
-        columns = values.reshape(len(values), -1)
-        found = np.column_stack(
-            [np.interp(seconds, self.seconds, column) for column in columns.T]
-        )
-        return found.reshape(len(seconds), *values.shape[1:])
+        row, share = self._between(seconds)
+        before = values[row]
+        share = share.reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(before + share * (values[row + 1] - before))
+
+    def _between(self, seconds: Floats) -> tuple[Ints, Floats]:
+        """Last sample before each instant, and the share of the way to the next one, shape (k,) both."""
+        row = np.searchsorted(self.seconds, seconds) - 1
+        row = np.minimum(np.maximum(row, 0), len(self.turns) - 1)
+        begin_s = self.seconds[row]
+        share = (seconds - begin_s) / (self.seconds[row + 1] - begin_s)
+        return row, np.minimum(np.maximum(share, 0.0), 1.0)
 
 
 def holes_before(stamps_ns: Ints) -> Ints:
@@ -130,8 +132,8 @@ def holes_before(stamps_ns: Ints) -> Ints:
 
 def strapdown_integrals(
     seconds: Floats, rate: Floats, force: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """C, F, S and P of the module's equations at every sample."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Turns between the samples, and C, F, S and P of the module's equations at every sample."""
     mean_rate = 0.5 * (rate[:-1] + rate[1:])
     turns = mean_rate * np.diff(seconds)[:, None]  # (n - 1, 3)
     from scipy.integrate import cumulative_trapezoid  # takes most of a second to load
@@ -142,7 +144,7 @@ def strapdown_integrals(
     F = integral(felt[:, :, 0])
     S = integral(C)
     P = integral(np.cross(felt, S, axis=1))
-    return C, F, S, P
+    return turns, C, F, S, P
 
 
 STRETCH_S = 30.0
@@ -228,8 +230,10 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     seconds = seconds[inside]
     velocity = dvl.velocity[inside] @ body_R_dvl.T  # (k, 3)
-    runs = list(stretches_of(seconds, path.parts_at(seconds)))
-    if len(runs) < LEAST_STRETCHES:
+    stretches = stretches_of(seconds, path.parts_at(seconds))
+    averaged = [Averaged.of(rows, seconds) for rows in stretches]
+    runs = [run for run in averaged if run is not None]
+    if len(averaged) < LEAST_STRETCHES:
         return DvlMatch.unknown(
             f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both and no hole of the IMU"
         )
@@ -320,11 +324,44 @@ def stretches_of(seconds: Floats, parts: Ints) -> Iterator[slice]:
                 yield slice(begin, end + 1)
 
 
+class Averaged(NamedTuple):
+    """A run of samples, of which means are compared; the same at every offset."""
+
+    rows: slice
+    slow: Floats
+    """Columns of gravity and its turning, shape (n, 3)."""
+    by_slow: Floats
+    """Their pseudoinverse, shape (3, n)."""
+    together: int
+    """Number of samples in a mean."""
+    duration_s: Floats
+    """Between two means, shape (m,)."""
+    B: Floats
+    """Derivatives by gravity and its turning, shape (m, 3, 6)."""
+
+    @classmethod
+    def of(cls, rows: slice, stamped_s: Floats) -> Self | None:
+        """The run; None where it is too short for a difference of means."""
+        since = stamped_s[rows] - stamped_s[rows].mean()
+        # by the stamps as they are: moved stamps are rounded, and 2.5 rows a second would become 2 or 3
+        interval_s = float(np.median(np.diff(stamped_s[rows])))
+        together = max(1, round(MEAN_OVER_S / interval_s))
+        t = means_over(since, together)
+        if len(t) < 2:
+            return None
+        slow = np.vander(since, 3)
+        duration = np.diff(t)
+        gravity = duration[:, None, None] * np.eye(3)
+        middle = t[:-1] + 0.5 * duration
+        B = np.concatenate([gravity, middle[:, None, None] * gravity], axis=2)
+        return cls(rows, slow, np.linalg.pinv(slow), together, duration, B)
+
+
 def velocity_changes(
     path: InertialPath,
     stamped_s: Floats,
     velocity: Floats,
-    runs: list[slice],
+    runs: list[Averaged],
     lever: Floats,
     offset_s: float,
 ) -> list[SampleSeries]:
@@ -340,19 +377,20 @@ def velocity_changes(
     S = path.linear_at(seconds, path.turned_time)  # (n, 3, 3)
     P = path.linear_at(seconds, path.tilted_impulse)  # (n, 3, 3)
     turning = C @ cross_matrices(path.linear_at(seconds, path.rate))  # C [w]x
-    x = np.einsum("nij,nj->ni", C, velocity) - turning @ lever - F
+    by_lever = turning @ lever
+    x = (C @ velocity[:, :, None])[:, :, 0] - by_lever - F
     changes = []
-    for r in runs:
-        since = seconds[r] - seconds[r].mean()
-        slow = np.vander(since, 3)  # gravity and its turning
-        line, *_ = np.linalg.lstsq(slow, x[r], rcond=None)
-        carried = F[r] + slow @ line + turning[r] @ lever  # C R v
-        in_body = np.einsum("nji,nj->ni", C[r], carried)
+    for run in runs:
+        r = run.rows
+        # gravity and its turning
+        line = run.by_slow @ x[r]
+        carried = F[r] + run.slow @ line + by_lever[r]  # C R v
+        in_body = (carried[:, None, :] @ C[r])[:, 0]
         S_since = S[r] - S[r][0]
-        P_since = P[r] - P[r][0]
         F_since = F[r] - F[r][0]
         drifting = (
-            P_since
+            P[r]
+            - P[r][0]
             - cross_matrices(F_since) @ S[r][0]
             - cross_matrices(carried) @ S_since
         )
@@ -364,24 +402,14 @@ def velocity_changes(
             -S_since,
             drifting,
         ]
-        # by the stamps as they are: moved stamps are rounded, and 2.5 rows a second would become 2 or 3
-        interval_s = float(np.median(np.diff(stamped_s[r])))
-        together = max(1, round(MEAN_OVER_S / interval_s))
-        t = means_over(since, together)
-        if len(t) < 2:  # too short for a difference of means
-            continue
-        upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], F_since[-1:])
-        level_R_g = np.asarray(upright.as_matrix())
-        y = np.diff(means_over(x[r], together), axis=0) @ level_R_g.T
-        A = level_R_g @ np.diff(
-            means_over(np.concatenate(columns, axis=2), together), axis=0
-        )
-        duration = np.diff(t)
-        gravity = duration[:, None, None] * np.eye(3)
-        middle = t[:-1] + 0.5 * duration
-        # (m, 3, 6)
-        B = np.concatenate([gravity, middle[:, None, None] * gravity], axis=2)
-        changes.append(SampleSeries(y, A, B, duration, walks=(True, True, False)))
+        # the signs of the axes do not matter
+        axes, _ = np.linalg.qr(F_since[-1:].T, "complete")
+        level_R_g = axes.T[::-1]
+        y = np.diff(means_over(x[r], run.together), axis=0) @ level_R_g.T
+        means = means_over(np.concatenate(columns, axis=2), run.together)
+        A = level_R_g @ np.diff(means, axis=0)
+        walks = (True, True, False)
+        changes.append(SampleSeries(y, A, run.B, run.duration_s, walks))
     return changes
 
 

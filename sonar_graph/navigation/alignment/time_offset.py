@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,6 +79,7 @@ def fit(
     parameters about zero, shape (p,), so wide that they matter only where the data determine nothing; a parameter whose
     covariance is the prior's was not observed. ``ratios``: of the noises; None: estimated from the data.
     """
+    groups = grouped(stretches)
     if ratios is None:
         rate = 1.0 / float(np.concatenate([s.duration_s for s in stretches]).mean())
         units = np.array([rate, rate**3])
@@ -88,7 +90,7 @@ def fit(
             )
 
         def criterion(logs: Floats) -> float:
-            return NormalEquations.of(stretches, bounded(logs)).criterion(prior_sigmas)
+            return NormalEquations.of(groups, bounded(logs)).criterion(prior_sigmas)
 
         start = np.array([[-2.0, -6.0], [1.0, -6.0], [-2.0, -2.0]])
         from scipy.optimize import minimize  # takes most of a second to load
@@ -100,9 +102,8 @@ def fit(
             options={"initial_simplex": start, "xatol": 0.1, "fatol": 0.02},
         )
         ratios = bounded(best.x)
-    parameters, information, rss, variance = NormalEquations.of(
-        stretches, ratios
-    ).solve(prior_sigmas)
+    normal = NormalEquations.of(groups, ratios)
+    parameters, information, rss, variance = normal.solve(prior_sigmas)
     covariance = np.asarray(variance * np.linalg.inv(information), dtype=np.float64)
     return LeastSquaresFit(parameters, covariance, rss, variance, ratios)
 
@@ -112,7 +113,8 @@ def are_enough(stretches: Sequence[SampleSeries], prior_sigmas: Floats) -> bool:
     if not stretches:
         return False
     ratios = np.ones(2)  # what is free does not depend on the noise
-    return NormalEquations.of(stretches, ratios).freedom > len(prior_sigmas)
+    normal = NormalEquations.of(grouped(stretches), ratios)
+    return normal.freedom > len(prior_sigmas)
 
 
 def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float:
@@ -122,11 +124,11 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
     its column of their covariance times this (errors in variables).
     """
     power = 0.0
-    for group in _grouped(stretches):
+    for group in grouped(stretches):
         count, m = group.duration_s.shape
         differences = np.diff(np.eye(m + 1), axis=0)[:, None, :]
         whole = np.broadcast_to(differences, (count, m, 3, m + 1))
-        white, _ = _whitened(group, group.B, ratios)
+        white, _ = _whitened(group, group.B, ratios)  # (s, 3, m, q)
         own, _, rank = _orthonormal(white.reshape(count, 3 * m, -1))
         of_samples, _ = _whitened(group, whole, ratios)  # (s, 3, m, m + 1)
         basis = own.reshape(count, 3, m, -1)
@@ -136,16 +138,29 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
     return power
 
 
-def _grouped(stretches: Sequence[SampleSeries]) -> list[SampleSeries]:
-    """Stretches of one length and kind together, each field with a leading axis: one call of LAPACK serves all."""
+class Group(NamedTuple):
+    """s stretches of one length and kind: one call of LAPACK serves all of them."""
+
+    data: Floats
+    """Columns y and A, shape (s, m, 3, 1 + p)."""
+    B: Floats
+    """Shape (s, m, 3, q)."""
+    duration_s: Floats
+    """Shape (s, m)."""
+    walks: tuple[bool, bool, bool]
+
+
+def grouped(stretches: Sequence[SampleSeries]) -> list[Group]:
+    """Stretches of one length and kind together."""
     groups: dict[tuple[object, ...], list[SampleSeries]] = {}
     for stretch in stretches:
         kind = (stretch.A.shape, stretch.B.shape, stretch.walks)
         groups.setdefault(kind, []).append(stretch)
     return [
-        SampleSeries(
-            np.array([one.y for one in group]),
-            np.array([one.A for one in group]),
+        Group(
+            np.array(
+                [np.concatenate([one.y[:, :, None], one.A], axis=2) for one in group]
+            ),
             np.array([one.B for one in group]),
             np.array([one.duration_s for one in group]),
             group[0].walks,
@@ -154,9 +169,7 @@ def _grouped(stretches: Sequence[SampleSeries]) -> list[SampleSeries]:
     ]
 
 
-def _whitened(
-    group: SampleSeries, columns: Floats, ratios: Floats
-) -> tuple[Floats, float]:
+def _whitened(group: Group, columns: Floats, ratios: Floats) -> tuple[Floats, float]:
     """Columns, shape (s, m, 3, k), by the inverse of the Cholesky factor of K, shape (s, 3, m, k); ``sum 3 log|K|``."""
     T = group.duration_s  # (s, m)
     count, m = T.shape
@@ -192,16 +205,15 @@ class NormalEquations:
     """``sum 3 log|K| + log|B' K^-1 B|``."""
 
     @classmethod
-    def of(cls, stretches: Sequence[SampleSeries], ratios: Floats) -> NormalEquations:
+    def of(cls, groups: Sequence[Group], ratios: Floats) -> NormalEquations:
         """Reduce each stretch and sum."""
-        p = stretches[0].A.shape[2]
+        p = groups[0].data.shape[3] - 1
         squares = np.zeros((1 + p, 1 + p))  # of [y, A]
         freedom = 0
         log_determinants = 0.0
-        for group in _grouped(stretches):
+        for group in groups:
             count, m = group.duration_s.shape
-            # (s, m, 3, 1 + p + q)
-            columns = np.concatenate([group.y[:, :, :, None], group.A, group.B], axis=3)
+            columns = np.concatenate([group.data, group.B], axis=3)
             white, log_size = _whitened(group, columns, ratios)
             white = white.reshape(count, 3 * m, -1)
             own, log_own, rank = _orthonormal(white[:, :, 1 + p :])
