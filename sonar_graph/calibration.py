@@ -322,6 +322,12 @@ class PlanarMotion(Section):
     tilt_sigma_rad: Positive = 1e-3
 
 
+UNKNOWN_HEIGHT = "height unknown, taken as 0"
+"""Words of the note ``log.start`` where neither sensor nor owner tells the height of the start."""
+UNKNOWN_HEIGHT_M = 5.0
+"""Sigma of a height in a map that nothing tells: a sonar sees artificial landmarks from near."""
+
+
 class Start(Section):
     """World pose of the body at the first instant with IMU and DVL, as a prior."""
 
@@ -366,11 +372,17 @@ class Start(Section):
         """True where the owner states these fields, instead of their defaults or measured ones."""
         return self.source == "stated" and self.model_fields_set.issuperset(names)
 
-    def in_map(self) -> Self:
-        """The start of a run with a known map: where nothing gives its place, the place is found in the map."""
+    def in_map(self, *, has_height: bool) -> Self:
+        """The start of a run with a known map: where nothing gives its place, the place is found in the map.
+
+        Without ``has_height`` nothing tells its height there, which is uncertain by `UNKNOWN_HEIGHT_M`.
+        """
         # heading and vehicle give no place in the world
-        is_placed = self.source not in ("heading", "vehicle")
-        return self if is_placed else self.model_copy(update={"source": "map"})
+        if self.source not in ("heading", "vehicle", "map"):
+            return self
+        x_m, y_m, z_m = self.position_sigma_m
+        sigmas_m = (x_m, y_m, z_m if has_height else UNKNOWN_HEIGHT_M)
+        return self.model_copy(update={"source": "map", "position_sigma_m": sigmas_m})
 
 
 class KnownMap(Section):
@@ -422,7 +434,9 @@ class KnownMap(Section):
         # a survey with one landmark in two rows
         twice = [i for i, count in Counter(self.ids).items() if count > 1]
         if twice:
-            raise misfits(type(self), {"ids": f"landmark {twice[0]} stands twice"})
+            raise misfits(
+                type(self), {"ids": f"landmark {twice[0]} stands twice; keep one"}
+            )
         both = sorted({*self.moved}.intersection(self.ids))
         if both:
             reason = f"landmark {both[0]} has a place too; leave its row out"

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sonar_graph.calibration import KnownMap
+from sonar_graph.calibration import UNKNOWN_HEIGHT, KnownMap
 from sonar_graph.errors import LogError
 from sonar_graph.files import replacing, text_of
 from sonar_graph.measurements import FIRST_TOO_LARGE_ID
@@ -39,6 +39,7 @@ COLUMNS = (
 )
 MOST_M = 1e5
 """A coordinate beyond it is in another unit, or of a grid of a country."""
+FROM_NEAR_BY = "give metres from an origin near by, along the world's axes"
 
 
 class ReadMap(NamedTuple):
@@ -95,9 +96,7 @@ def read_map(path: Path) -> ReadMap:
     # national grids and millimetres are the usual mistakes
     farthest_m = float(np.abs(np.array(known.positions_m)).max())
     if farthest_m > MOST_M:
-        raise LogError(
-            f"{path}: a landmark at {farthest_m:.0f} m: give metres from an origin near by, along the world's axes"
-        )
+        raise LogError(f"{path}: a landmark at {farthest_m:.0f} m: {FROM_NEAR_BY}")
     return ReadMap(known, warnings)
 
 
@@ -117,16 +116,26 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         raise LogError(
             f"{path}: expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}{apart}"
         )
+    if has_axes < bool(set(SIGMAS) & set(heads)):
+        raise LogError(f"{path}: expected all of {', '.join(SIGMAS)}, or sigma_m alone")
+    if twice := [head for head in heads if heads.count(head) > 1]:
+        raise LogError(f"{path}: two columns are called {twice[0]}; keep one")
     ids: list[int] = []
     places: list[list[float]] = []
     blocks: list[np.ndarray] = []
     for row in reader:
         where = f"{path}, line {reader.line_num}"
+        # the key of cells beyond the heading
+        if None in row:
+            raise LogError(
+                f"{where}: {len(heads) + len(row[None])} cells, the heading names {len(heads)}"
+            )
 
         def number(column: str, row: dict[str, str] = row, where: str = where) -> float:
             try:
-                value = float(row[column])
-            except (TypeError, ValueError):
+                # Python takes 1_0 for 10
+                value = float((row[column] or "").replace("_", "?"))
+            except ValueError:
                 value = math.nan
             if not math.isfinite(value):
                 shown = repr(row[column]) if row[column] else "an empty cell"
@@ -144,8 +153,17 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
             raise LogError(
                 f"{where}: landmark {landmark_id} stands twice; keep one line"
             )
+        if landmark_id >= FIRST_TOO_LARGE_ID:
+            raise LogError(
+                f"{where}: id: give identities below {FIRST_TOO_LARGE_ID}, as detections have them"
+            )
         ids.append(landmark_id)
-        places.append([number(column) for column in PLACE])
+        place = [number(column) for column in PLACE]
+        if max(map(abs, place)) > MOST_M:
+            raise LogError(
+                f"{where}: a landmark at {max(map(abs, place)):.0f} m: {FROM_NEAR_BY}"
+            )
+        places.append(place)
         if is_marginal:
             block = np.zeros((3, 3))
             # upper triangle, mirrored below
@@ -154,9 +172,9 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         else:
             columns = SIGMAS if has_axes else ("sigma_m",) * 3
             sigmas = [number(column) for column in columns]
-            if min(sigmas) <= 0.0:
+            if not 0.0 < min(sigmas) <= max(sigmas) <= MOST_M:
                 raise LogError(
-                    f"{where}: {columns[0]}: expected a sigma above 0 m, such as 0.001"
+                    f"{where}: {columns[0]}: expected a sigma above 0 m, such as 0.001, and below {MOST_M:g}"
                 )
             blocks.append(np.diag(np.square(sigmas)))
     if not ids:
@@ -198,7 +216,14 @@ def in_map(sequence: Sequence, path: Path) -> Sequence:
     The note ``log.map`` of the sequence describes what was done.
     """
     known, warnings = read_map(path)
-    start = sequence.calibration.start.in_map()
+    given = sequence.calibration
+    has_height = UNKNOWN_HEIGHT not in sequence.notes.get("log.start", "")
+    start = given.start.in_map(has_height=has_height)
+    if start.source == "map" and not has_height:
+        warnings.append(
+            "neither depth nor fixes tell the height of the vehicle in the map, which the filters linearise badly; state "
+            "it as z of `position_m = [0, 0, -2]` under [start] in a file for --calibration"
+        )
     note = f"{counted(len(known.ids), 'landmark')} of {path.name}"
     if start.source == "map":
         note += "; the start is looked for in it, by identified landmarks"

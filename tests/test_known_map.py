@@ -2,30 +2,35 @@
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
-from sonar_graph.calibration import Calibration, KnownMap, Start
+from sonar_graph.calibration import UNKNOWN_HEIGHT, Calibration, KnownMap, Start
 from sonar_graph.diagnosis.start_place import map_findings
 from sonar_graph.errors import LogError, SettingError
 from sonar_graph.estimator import known_map_of
 from sonar_graph.evaluation import compare
 from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.models import KnownLandmarks
+from sonar_graph.models import KnownLandmarks, elevation_on_floor, locate
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_check import exchanged_identities
 from sonar_graph.navigation.map_start import (
+    BodyInFrame,
     IdentityWeights,
     MapLocator,
     MapSighting,
+    Ray,
     agreement,
     candidates,
     located,
     map_data,
     moved_landmarks,
+    refined,
+    spread,
 )
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.given_map import given_map_table, located_line
@@ -289,7 +294,7 @@ def test_landmarks_below_the_aperture_do_not_bend_a_found_start(dive):
     level = ranges_m * [np.cos(angles), np.sin(angles)]
     places = np.array([start.transformFrom(np.array([x, y, -2.5])) for x, y in level.T])
     seen = in_view(dive, places)
-    narrow = seen.calibration.sonar.model_copy(update={"elevation_aperture_rad": 0.2})
+    narrow = seen.calibration.sonar.model_copy(update={"elevation_aperture_rad": 0.4})
     calibration = seen.calibration.model_copy(update={"sonar": narrow})
     known = KnownMap.of(range(3), places, sigma_m=SIGMA_M)
     lost = with_map(replace(seen, calibration=calibration), known, unknown_start(dive))
@@ -300,6 +305,86 @@ def test_landmarks_below_the_aperture_do_not_bend_a_found_start(dive):
     _, x, y = locator.found.parameters
     np.testing.assert_allclose([x, y], start.translation()[:2], atol=0.1)
     assert not any(sighting.is_in_view for sighting in locator.sightings)
+
+
+def test_a_found_start_has_the_height_of_the_depths(dive):
+    """A start that is 3 m too high, to 2 m: odometry alone would carry that on."""
+    known = surveyed(dive)
+    start = unknown_start(dive)
+    x, y, z = start.position_m
+    sigmas_m = (*start.position_sigma_m[:2], 2.0)
+    high = start.model_copy(
+        update={"position_m": (x, y, z + 3.0), "position_sigma_m": sigmas_m}
+    )
+    found = [locator_after(with_map(dive, known, each)).found for each in (start, high)]
+    np.testing.assert_allclose(found[1].parameters, found[0].parameters, atol=0.05)
+
+
+def locator_after(dive: Sequence) -> MapLocator:
+    locator = MapLocator(dive.calibration)
+    for window in dive.replay(dive.instants(2.0)):
+        locator.add(window)
+    return locator
+
+
+@pytest.mark.parametrize("elevation_rad", [-0.6, 0.0, 0.3])
+@pytest.mark.parametrize("roll_rad", [0.0, 0.4])
+def test_a_place_is_as_uncertain_as_range_azimuth_pose_and_heights_make_it(
+    elevation_rad, roll_rad
+):
+    """By Monte Carlo: draw all of them, and place the landmark at the height of the map again."""
+    rng = np.random.default_rng(2)
+    o_T_body = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll_rad, 0.1, 0.7), np.array([3, 1, -2]))
+    body_T_sonar = gtsam.Pose3(gtsam.Rot3.Ry(0.2), np.array([0.3, 0.0, 0.1]))
+    ray = Ray(8.0, 0.3, elevation_rad)
+    floor_z = locate(o_T_body.compose(body_T_sonar), *ray)[2]
+    sigmas = np.array([0.01, 0.01, 0.01, 0.03, 0.03, 0.03])
+    height_m, floor_m = 0.05, 0.08
+    R_z = np.diag([0.03**2, 0.01**2])
+    body = BodyInFrame(o_T_body, np.diag(sigmas**2), height_m**2)
+    S = spread(body, o_T_body.compose(body_T_sonar), ray, R_z, floor_m**2)
+    drawn = []
+    for _ in range(4000):
+        pose = o_T_body.compose(gtsam.Pose3.Expmap(sigmas * rng.standard_normal(6)))
+        # the mean of MOST_OF_LANDMARK sightings has these errors in full
+        by_heights = 2.0 * np.hypot(height_m, floor_m) * rng.standard_normal()
+        o_T_sonar = pose.compose(body_T_sonar)
+        z = np.array([8.0, 0.3]) + [0.03, 0.01] * rng.standard_normal(2)
+        e = elevation_on_floor(o_T_sonar, *z, floor_z + by_heights, 2 * np.pi)
+        drawn.append(locate(o_T_sonar, *z, e)[:2])
+    found = np.cov(np.array(drawn).T)
+    ratios = np.linalg.eigvals(np.linalg.solve(S, found))
+    assert (np.abs(ratios - 1.0) < 0.15).all(), ratios
+
+
+def test_a_height_that_nothing_tells_is_uncertain_in_a_map(dive, tmp_path):
+    write_map(tmp_path / "map.toml", surveyed(dive))
+    note = {"log.start": f"start pose not stated: {UNKNOWN_HEIGHT}"}
+    start = dive.calibration.start.model_copy(update={"source": "vehicle"})
+    unknown = replace(with_map(dive, None, start), notes=note)
+    found = in_map(unknown, tmp_path / "map.toml")
+    assert found.calibration.start.position_sigma_m[2] > 1.0
+    assert "state it as z of `position_m" in found.notes["log.warnings"]
+    told = replace(unknown, notes={"log.start": "height by the first depths"})
+    found = in_map(told, tmp_path / "map.toml")
+    assert found.calibration.start.position_sigma_m[2] < 0.1
+    assert "log.warnings" not in found.notes
+
+
+def test_a_found_start_that_most_landmarks_refute_later_is_given_up():
+    """Two landmarks that agree are a start; three that stand elsewhere make it none."""
+    known = random_map(np.random.default_rng(1), 10)
+    locator = MapLocator(Calibration(map=known))
+    data = map_data([seen_from_start(known, i) for i in range(3)], known)
+    (locator.found, *_) = candidates(data)
+    locator._give_up_if_refuted(data)
+    assert locator.found is not None
+    right = [seen_from_start(known, i) for i in range(3)]
+    moved = [seen_from_start(known, i, 5.0 + i) for i in (3, 4, 5) for _ in range(3)]
+    locator._give_up_if_refuted(map_data(right + moved[:6], known))
+    assert locator.found is not None
+    locator._give_up_if_refuted(map_data(right + moved, known))
+    assert locator.found is None
 
 
 def test_no_pose_is_claimed_in_a_map_of_another_place(dive):
@@ -363,10 +448,23 @@ def test_the_heading_of_two_landmarks_near_each_other_refutes_no_third():
     S = np.diag([0.02**2, 0.05**2])
     data = map_data([MapSighting(i, places[i, :2], S) for i in range(3)], known)
     turned = np.array([0.05, 0.0, 0.0])
-    _, agreeing = agreement(turned, np.zeros((3, 3)), data)
+    pair = np.array([True, True, False])
+    _, agreeing = agreement(turned, np.zeros((3, 3)), pair, data)
     assert agreeing.tolist() == [True, True, False]
-    _, agreeing = agreement(turned, np.diag([0.05**2, 0.0, 0.0]), data)
+    # turned about the landmark far away, so that heading and place err together
+    about_it = np.array([1.0, 5.0, -40.0])
+    P = 0.05**2 * np.outer(about_it, about_it)
+    _, agreeing = agreement(turned, P, pair, data)
+    assert agreeing.tolist() == [True, True, False]
+    P = np.diag([0.05**2, 0.0, 0.0])
+    _, agreeing = agreement(turned, P, pair, data)
     assert agreeing.all()
+    start = refined(turned, data)
+    assert start is not None
+    assert start.agreeing == {0, 1, 2}
+    # a landmark that gave the start has its own error in it
+    _, agreeing = agreement(turned, P, np.ones(3, bool), data)
+    assert agreeing.tolist() == [True, True, False]
 
 
 def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):
@@ -664,7 +762,7 @@ BAD = {
     "twice": (HEAD + "1,0,2,3,0.1\n1,0,2,3,0.1\n", "line 3: landmark 1 stands twice"),
     "an id that no graph has": (
         HEAD + f"{2**56},0,2,3,0.1\n",
-        f"landmark {2**56}: give identities below {2**56}",
+        f"line 2: id: give identities below {2**56}",
     ),
     "an exact place": (
         "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz\n4,0,2,3,0,0,0,0,0,0\n",
@@ -677,6 +775,20 @@ BAD = {
     ),
     "no sigma": (HEAD + "1,0,2,3,0\n", "expected a sigma above 0 m"),
     "a negative identity": (HEAD + "-1,0,2,3,0.1\n", "whole numbers from 0 on"),
+    "a huge sigma": (HEAD + "1,0,2,3,1e200\n", "line 2: sigma_m: expected a sigma"),
+    "too many cells": (
+        HEAD + "1,0,2,3,0.1,7\n",
+        "line 2: 6 cells, the heading names 5",
+    ),
+    "a grouped number": (HEAD + "1_0,0,2,3,0.1\n", "line 2: id: expected a number"),
+    "a column twice": (
+        "id,x_m,x_m,y_m,z_m,sigma_m\n1,0,9,2,3,0.1\n",
+        "two columns are called x_m",
+    ),
+    "one sigma of three": (
+        "id,x_m,y_m,z_m,sigma_x_m,sigma_m\n1,0,2,3,0.1,0.2\n",
+        "expected all of sigma_x_m, sigma_y_m, sigma_z_m, or sigma_m alone",
+    ),
     "semicolons": (HEAD.replace(",", ";"), "separate them by commas"),
     "a grid of a country": (
         HEAD + "1,512345,2,3,0.1\n",

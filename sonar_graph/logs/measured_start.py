@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Start
+from sonar_graph.calibration import UNKNOWN_HEIGHT, Calibration, Start
 from sonar_graph.logs.adapters import plain_lines
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints
 from sonar_graph.numerics import columns_at, running_integral, running_rotations
@@ -141,15 +141,17 @@ def with_measured_start(
             update={"source": "stated" if "position_m" in stated else "heading"}
         )
     start = start.model_copy(update=stated)
-    if calibration.map is not None:
-        start = start.in_map()
-    height = (
-        "height by the first depths"
-        if blocks.get("depth") is not None
-        else "height unknown, taken as 0"
-    )
-    if blocks.get("depth") is None and blocks.get("positions") is not None:
+    height = UNKNOWN_HEIGHT
+    if "position_m" in stated:
+        height = "height as stated"
+    elif blocks.get("depth") is not None:
+        height = "height by the first depths"
+    elif blocks.get("positions") is not None:
         height = "height by the first fixes"
+    elif calibration.planar is not None:
+        height = "height of the plane"
+    if calibration.map is not None:
+        start = start.in_map(has_height=height != UNKNOWN_HEIGHT)
     what = (
         f"of the start only {' and '.join(stated)} stated"
         if stated

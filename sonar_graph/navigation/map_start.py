@@ -30,6 +30,7 @@ Inference, and Learning Algorithms", 2003, chapter 28 (evidence).
 """
 
 import math
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
@@ -82,6 +83,10 @@ LINEAR_SIGMAS = 3.0
 LOOSER = 3.0
 """Sigmas of the prior start over those found: the estimator weighs the same sightings itself, so that a ninth of their
 information counts twice. With a looser prior it would follow a moved landmark that it sees first."""
+VERTICAL_M_S = 0.5
+"""Vertical speed that a depth may have missed since it was measured."""
+LEAST_RISE = 0.05
+"""Rise of the sonar's fan with elevation, beside which it counts as level."""
 WATCHED_S = 120.0
 """Time after the vehicle was located in which a better start replaces a wrong one."""
 SAME = 10.0
@@ -117,6 +122,24 @@ class FoundStart(NamedTuple):
     """Rows of the landmarks that agree with it."""
 
 
+class BodyInFrame(NamedTuple):
+    """Pose of the body in o at a frame."""
+
+    o_T_body: gtsam.Pose3
+    C: Floats
+    """Covariance of its perturbation, in its own axes, shape (6, 6)."""
+    height_m2: float = 0.0
+    """Variance of its height beside C."""
+
+
+class DepthRow(NamedTuple):
+    """Height of the pressure port."""
+
+    stamp_ns: int
+    z_m: float
+    variance_m2: float
+
+
 class MapLocator:
     """Finds the start in a map, frame by frame; results depend on stamps alone."""
 
@@ -141,17 +164,21 @@ class MapLocator:
         sonar = calibration.sonar
         self._body_T_sonar = sonar.mounting.pose()
         self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
+        self._heights_m2 = np.diag(self.map.joint())[2::3].tolist()
+        """Variances of the landmarks' heights."""
+        self._depths: list[DepthRow] = []
 
     def add(self, measurements: Measurements) -> None:
         """Take in measurements, and look for the start, or for a better one, after each frame."""
         for stamp_ns in self.frames_seen(measurements):
             if not self.is_watching(stamp_ns):
                 return
+            of_all = newest_of_each(self.sightings, MOST_OF_LANDMARK)
+            data = map_data(of_all, self.map)
+            self._give_up_if_refuted(data)
             best = located(self.newest(), self.map)
             if best is None:
                 continue
-            of_all = newest_of_each(self.sightings, MOST_OF_LANDMARK)
-            data = map_data(of_all, self.map)
             if self.found is not None and not outweighs(best, self.found, data):
                 continue
             moved = moved_landmarks(best, data)
@@ -163,13 +190,36 @@ class MapLocator:
             self._found_ns.append(stamp_ns)
             self.moved = [self.map.ids[row] for row in moved]
 
+    def _give_up_if_refuted(self, data: "MapData") -> None:
+        """Forget a start from which as many landmarks stand elsewhere by now as agree."""
+        if self.found is None:
+            return
+        # odometry has drifted since
+        start = refined(self.found.parameters, data)
+        if start is None or len(moved_landmarks(start, data)) < len(start.agreeing):
+            return
+        self._refuted = start
+        self.found = None
+        self.moved = []
+
     def is_watching(self, stamp_ns: int) -> bool:
         """True as long as the start may still change."""
-        return not self._found_ns or stamp_ns <= self._found_ns[0] + WATCHED_S * 1e9
+        return self.found is None or stamp_ns <= self._found_ns[0] + WATCHED_S * 1e9
 
     def frames_seen(self, measurements: Measurements) -> Iterator[int]:
         """Take in measurements; yields the stamp of each frame that shows landmarks of the map, once it is taken in."""
         self._odometry.add(measurements.imu, measurements.dvl)
+        if (depth := measurements.depth) is not None:
+            sigma_m = self._calibration.depth.sigma_m
+            unknown = np.isnan(depth.variance_m2)
+            variance_m2 = np.where(unknown, sigma_m**2, depth.variance_m2)
+            rows = zip(depth.stamps_ns, depth.z_m, variance_m2, strict=True)
+            last_ns = self._depths[-1].stamp_ns if self._depths else 0
+            self._depths += [
+                DepthRow(int(stamp_ns), float(z_m), float(variance))
+                for stamp_ns, z_m, variance in rows
+                if stamp_ns > last_ns
+            ]
         if measurements.detections is None:
             return
         for frame in measurements.detections.frames():
@@ -227,10 +277,10 @@ class MapLocator:
             o_T_start.rotation().matrix(),
             stamp_ns,
         )
-        o_T_body = o_T_start.compose(motion.i_T_j)
-        o_T_sonar = o_T_body.compose(self._body_T_sonar)
         by_bias = motion.D_bias * self._calibration.imu.gyro_bias_sigma  # (6, 3)
         C = motion.covariance + by_bias @ by_bias.T
+        body = self._at_depth(BodyInFrame(o_T_start.compose(motion.i_T_j), C), stamp_ns)
+        o_T_sonar = body.o_T_body.compose(self._body_T_sonar)
         half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
         for k in rows:
             row = self._rows[int(ids[k])]
@@ -242,14 +292,37 @@ class MapLocator:
                 float(self._places[row, 2]),
                 aperture_rad=2.0 * math.pi,
             )
-            point = locate(o_T_sonar, float(z[0]), float(z[1]), elevation_rad or 0.0)
+            sight = Ray(float(z[0]), float(z[1]), elevation_rad or 0.0)
+            point = locate(o_T_sonar, *sight)
             R_z = frame.range_azimuth_cov[k]
             R_z = self._R_z if np.isnan(R_z).any() else R_z
-            S = spread(o_T_body, o_T_sonar, point, R_z, C)
+            of_floor_m2 = self._heights_m2[row] if elevation_rad is not None else 0.0
+            S = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
             # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
             is_in_view = elevation_rad is not None and abs(elevation_rad) <= half_rad
             self.sightings.append(MapSighting(row, point[:2], S, is_in_view))
         return True
+
+    def _at_depth(self, body: BodyInFrame, stamp_ns: int) -> BodyInFrame:
+        """The body at the height of the last depth, where that is better known than by odometry."""
+        start_m2 = self._calibration.start.position_sigma_m[2] ** 2
+        R = body.o_T_body.rotation().matrix()
+        carried_m2 = start_m2 + float(R[2] @ body.C[3:, 3:] @ R[2])
+        last = bisect_right(self._depths, stamp_ns, key=lambda depth: depth.stamp_ns)
+        if not last:
+            return body._replace(height_m2=start_m2)
+        depth = self._depths[last - 1]
+        since_s = (stamp_ns - depth.stamp_ns) * 1e-9
+        depth_m2 = depth.variance_m2 + (VERTICAL_M_S * since_s) ** 2
+        if depth_m2 > carried_m2:
+            return body._replace(height_m2=start_m2)
+        x, y, _ = body.o_T_body.translation()
+        z = depth.z_m - R[2] @ self._calibration.depth.port_m
+        o_T_body = gtsam.Pose3(body.o_T_body.rotation(), np.array([x, y, z]))
+        # without the error of odometry along the vertical
+        level = np.eye(6)
+        level[3:, 3:] -= np.outer(R[2], R[2])
+        return BodyInFrame(o_T_body, level @ body.C @ level.T, depth_m2)
 
     def newest(self) -> list[MapSighting]:
         """The newest sightings, a few of each landmark, in the order of time."""
@@ -300,29 +373,50 @@ def newest_of_each(sightings: list[MapSighting], most: int) -> list[MapSighting]
     return newest[::-1]
 
 
-def spread(
-    o_T_body: gtsam.Pose3,
-    o_T_sonar: gtsam.Pose3,
-    point: Floats,
-    R_z: Floats,
-    C: Floats,
-) -> Floats:
-    """Covariance of the level place of a point that was seen, shape (2, 2), m².
+class Ray(NamedTuple):
+    """A landmark as the sonar sees it, at the elevation of its height in the map."""
 
-    ``R_z``: of range and azimuth; ``C``: of the perturbation of the body's pose, in its own axes, shape (6, 6).
+    range_m: float
+    azimuth_rad: float
+    elevation_rad: float
+
+
+def spread(
+    body: BodyInFrame, o_T_sonar: gtsam.Pose3, sight: Ray, R_z: Floats, floor_m2: float
+) -> Floats:
+    """Covariance of the level place of a landmark, shape (2, 2), m².
+
+    ``R_z``: of range and azimuth; ``floor_m2``: variance of its height in the map. Where the body errs in height by h, or
+    turns the landmark up by h, the elevation changes until the height is that of the map again.
     """
-    sight = point - o_T_sonar.translation()
-    range_m = float(np.linalg.norm(sight))
-    along = sight / range_m
+    point = locate(o_T_sonar, *sight)
+    along = (point - o_T_sonar.translation()) / sight.range_m
+    sonar_R = o_T_sonar.rotation().matrix()
     # azimuth turns the sight about the sonar's third axis
-    across = np.cross(o_T_sonar.rotation().matrix()[:, 2], along)
-    by_z = np.column_stack([along, range_m * across])  # (3, 2)
-    R = o_T_body.rotation().matrix()
-    x, y, z = o_T_body.transformTo(point)
-    by_turn = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    across = np.cross(sonar_R[:, 2], along)
+    by_z = np.column_stack([along, sight.range_m * across])  # (3, 2)
+    R = body.o_T_body.rotation().matrix()
+    by_turn = -R @ cross_matrix(body.o_T_body.transformTo(point))
     by_body = np.hstack([by_turn, R])  # (3, 6)
-    cov = by_z @ R_z @ by_z.T + by_body @ C @ by_body.T
-    return np.asarray(cov[:2, :2])
+    cov = by_z @ R_z @ by_z.T + by_body @ body.C @ by_body.T  # (3, 3)
+    cov[2, 2] += MOST_OF_LANDMARK * (body.height_m2 + floor_m2)
+    sin_e = math.sin(sight.elevation_rad)
+    in_fan = [math.cos(sight.azimuth_rad), math.sin(sight.azimuth_rad)]
+    up_fan = sonar_R @ [
+        -sin_e * in_fan[0],
+        -sin_e * in_fan[1],
+        math.cos(sight.elevation_rad),
+    ]
+    rise = math.copysign(max(abs(up_fan[2]), LEAST_RISE), up_fan[2])
+    by_height = up_fan[:2] / rise  # of the level place
+    T = np.column_stack([np.eye(2), -by_height])  # (2, 3)
+    return np.asarray(T @ cov @ T.T)
+
+
+def cross_matrix(v: Floats) -> Floats:
+    """``[v]x`` with ``[v]x w = v x w``, shape (3, 3)."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
@@ -461,10 +555,10 @@ def turn(psi: float) -> Floats:
 def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     """Least squares of (1) over the landmarks that agree, with the evidence (2)."""
     seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
-    agreeing = np.zeros(len(seen), bool)
+    agreeing = np.ones(len(seen), bool)
     covariance = np.zeros((3, 3))
     for _ in range(STEPS):
-        agrees, agreeing = agreement(parameters, covariance, data)
+        agrees, agreeing = agreement(parameters, covariance, agreeing, data)
         if np.count_nonzero(agreeing) < 2:
             return None
         q, S = mean_sightings(agrees[agreeing], data)  # (a, 2), (a, 2, 2)
@@ -492,13 +586,19 @@ def refined(parameters: Floats, data: MapData) -> FoundStart | None:
     return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
 
 
-def agreement(parameters: Floats, covariance: Floats, data: MapData) -> tuple[Any, Any]:
-    """Sightings of each landmark within the ellipse of (1), shape (l, k), and landmarks with most of them, (l,)."""
+def agreement(
+    parameters: Floats, covariance: Floats, fitted: Any, data: MapData
+) -> tuple[Any, Any]:
+    """Sightings of each landmark within the ellipse of (1), shape (l, k), and landmarks with most of them, (l,).
+
+    ``covariance``: of the start; ``fitted``: the landmarks that gave it, shape (l,), whose errors it has in it.
+    """
     R = turn(parameters[0])
     e = data.places[data.rows] - data.q @ R.T - parameters[1:]  # (k, 2)
     J = np.tile(np.eye(2, 3, 1), (len(e), 1, 1))  # (k, 2, 3)
     J[:, :, 0] = data.q @ turn(parameters[0] + 0.5 * math.pi).T
     # a heading by two landmarks near each other is too uncertain to place a third one far away
+    J[data.is_of[fitted].any(axis=0)] = 0.0
     of_start = J @ covariance @ J.transpose(0, 2, 1)  # (k, 2, 2)
     W = R @ data.S @ R.T + data.place_cov[data.rows] + of_start  # (k, 2, 2)
     squared = np.einsum("ki,ki->k", e, np.linalg.solve(W, e[:, :, None])[:, :, 0])
@@ -517,7 +617,9 @@ def outweighs(best: FoundStart, other: FoundStart, data: MapData) -> bool:
 
 def moved_landmarks(start: FoundStart, data: MapData) -> list[int]:
     """Rows of the landmarks that disagree with a start, and stand elsewhere."""
-    _, agreeing = agreement(start.parameters, start.covariance, data)
+    seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
+    fitted = np.isin(seen, list(start.agreeing))
+    _, agreeing = agreement(start.parameters, start.covariance, fitted, data)
     return [
         int(data.rows[is_of][0])
         for is_of in data.is_of[~agreeing]
@@ -598,6 +700,7 @@ class StartInMap:
         """Estimate by the newest measurements; where the start has changed, by all of them."""
         found = self._locator.found
         if found is None:
+            self._inner = None
             return None
         if self._inner is not None and found is self._begun_at:
             return self._inner.process(newest)
