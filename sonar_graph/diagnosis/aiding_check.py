@@ -19,9 +19,11 @@ from sonar_graph.diagnosis.causes import (
     OF_FIXES,
     OF_RANGES,
     PITCH,
+    SOFT_IRON,
     SONAR_TURN,
     Cause,
     cause_of,
+    excursion,
     of_scale,
     step_text,
 )
@@ -320,7 +322,7 @@ HEADING = Check(
     ),
     least_scale=0.01,
     quantity=HEADING_SENSE,
-    causes=(DEVIATION,),
+    causes=(DEVIATION, SOFT_IRON),
     step_unit="°",
     is_angle=True,
 )
@@ -334,7 +336,8 @@ POSITIONS = Check(
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda config: Advice(
         "north and east are exchanged",
-        f"{other_world(config, 'positions')}, or the fields of position in another order",
+        f"{other_world(config, 'positions')}, or the fields of position in another order; of latitude and longitude, one "
+        "without its sign",
     ),
     scaled=lambda config, gain: Advice(
         "",
@@ -554,10 +557,15 @@ class SensorComparison:
             )
         unit = units[0] if units else "another unit"
         times = 1.0 / check.units.get(unit, 1.0 / size)
+        line = check.other_lines.get(unit)
+        line = line or scale_line(check.role, check.scale_key, self.config, times)
+        if check.is_angle:
+            line += "; of an orientation, whose quaternion is wrong then, " + unused(
+                check.role
+            )
         return self.contradiction(
             f"it changes {size:.3g} times as much as by {check.against}: {' or '.join(units) or unit}?",
-            check.other_lines.get(unit)
-            or scale_line(check.role, check.scale_key, self.config, times),
+            line,
         )
 
     def unrelated(self) -> Finding | None:
@@ -725,6 +733,8 @@ def heading_drift(drift: Estimate1D, turned_rad: float) -> Finding:
     )
 
 
+LEAST_EXCURSION_RAD = np.radians(10.0)
+EXCURSION_SIGMAS = 3.0
 HIGHEST_M = 1.0
 """Height above the surface that waves and the weather give a pressure sensor there."""
 FARTHEST_FROM_START_M = 0.5
@@ -839,8 +849,18 @@ def heading_findings(
         return
     rows = findings_of(HEADING, found, right, config)
     yield from rows
-    if not rows[0].grave:
-        yield from heading_turn(right, config, motion)
+    if rows[0].grave:
+        return
+    bias_sigma_rad = right.calibration.heading.bias_sigma_rad
+    least_rad = max(LEAST_EXCURSION_RAD, EXCURSION_SIGMAS * bias_sigma_rad)
+    if left := excursion(found, least_rad):
+        yield contradiction(
+            "heading: excursion from that by the gyros",
+            f"it leaves them {left} and comes back: a compass near iron, or an outage of its source",
+            f"{unused('heading')} leaves it out, --start and --end that time",
+            "disturbed",
+        )
+    yield from heading_turn(right, config, motion)
 
 
 def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Finding]:

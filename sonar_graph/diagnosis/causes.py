@@ -86,6 +86,13 @@ def of_turn(stretch: SignalStretch) -> Values:
     return np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), since_middle(stretch)])
 
 
+def of_turn_and_twice(stretch: SignalStretch) -> Values:
+    """Directions of the heading and of twice the heading, and a drift of the gyros, shape (n, 5)."""
+    twice_rad = 2.0 * stretch.y.real
+    soft = np.column_stack([np.cos(twice_rad), np.sin(twice_rad)])
+    return np.hstack([soft, of_turn(stretch)])
+
+
 def of_current(stretch: SignalStretch) -> Values:
     """Time, and the path itself, whose turn and scale are other findings, shape (n, 2)."""
     x = stretch.shifted(np.zeros(1))[0]
@@ -219,6 +226,8 @@ DEVIATION = Cause(
     least=lambda known: max(LEAST_DEVIATION_RAD, 2.0 * known.heading.bias_sigma_rad),
     advice=deviation_advice,
 )
+# iron that the Earth magnetises beside magnets on the vehicle
+SOFT_IRON = replace(DEVIATION, columns=of_turn_and_twice, wanted=4)
 SONAR_TURN = Cause(
     "turn of the sonar",
     "°",
@@ -281,6 +290,52 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
             size = np.degrees(step.size) if unit == "°" else step.size
             texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
     return " and ".join(texts[:LONGEST_LIST])
+
+
+EXCURSION_OVER_S = 5.0
+"""Time over which noise and waves average out of a heading."""
+FEWEST_MEANS = 12
+MOST_PAIRS = 20_000
+EXCURSION_SCATTERS = 8.0
+MOST_OFF = 0.4
+"""Share of the log; a sensor that is off for longer has other faults."""
+
+
+def excursion(found: Match, least: float) -> str:
+    """Size and time of a stretch in which a sensor leaves its reference and comes back; empty without one.
+
+    The means over some seconds of what it has beyond the reference are on a line, by the median of the slopes (Theil,
+    Sen), but for a share of them.
+    """
+    for whole in found.whole:
+        beyond = whole.excess()
+        is_known = np.isfinite(beyond.y.real)
+        t = beyond.seconds[is_known]
+        if not len(t):
+            continue
+        block = ((t - t[0]) // EXCURSION_OVER_S).astype(int)
+        _, first = np.unique(block, return_index=True)
+        count = np.diff([*first, len(t)])
+        middle_s = np.add.reduceat(t, first) / count
+        mean = np.add.reduceat(beyond.y.real[is_known], first) / count
+        if len(mean) < FEWEST_MEANS:
+            continue
+        i, j = np.triu_indices(len(mean), 1)
+        every = max(1, len(i) // MOST_PAIRS)
+        rise = mean[j[::every]] - mean[i[::every]]
+        slope = np.median(rise / (middle_s[j[::every]] - middle_s[i[::every]]))
+        off = mean - slope * middle_s
+        off -= np.median(off)
+        scatter = 1.4826 * float(np.median(np.abs(off)))
+        is_off = np.abs(off) > max(least, EXCURSION_SCATTERS * scatter)
+        if is_off.any() and is_off.mean() <= MOST_OFF:
+            rows = np.flatnonzero(is_off)
+            largest_deg = np.degrees(off[np.abs(off).argmax()])
+            begin_s, end_s = middle_s[rows[[0, -1]]]
+            return (
+                f"by up to {largest_deg:.2g}° between {begin_s:.0f} and {end_s:.0f} s"
+            )
+    return ""
 
 
 def velocity_steps(sequence: Sequence) -> Finding | None:

@@ -27,6 +27,7 @@ from sonar_graph.diagnosis.aiding_check import (
     VERTICAL_BIAS,
     findings_of,
     fix_height_findings,
+    fix_match,
     heading_findings,
     position_findings,
     start_depth_findings,
@@ -53,6 +54,7 @@ from sonar_graph.diagnosis.findings import (
     matters,
     notes_of,
     numbers,
+    other_world,
     scale_line,
     shift_line,
     signed_axes,
@@ -105,7 +107,7 @@ from sonar_graph.logs import (
     stuck_quantities,
 )
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, PositionFixes
 from sonar_graph.navigation.alignment import (
     DvlMatch,
     Estimate1D,
@@ -892,7 +894,10 @@ def reference_findings(
     """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
     reference = right.true_poses
-    if reference is None:
+    mirrored = mirrored_reference(right, config)
+    if reference is None or mirrored is not None:
+        if mirrored is not None:
+            yield mirrored
         yield from tilt_findings(tilt, right.calibration, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, reference, right.calibration)
@@ -918,8 +923,62 @@ def reference_findings(
         yield heading.finding(tilt)
 
 
+def mirrored_reference(sequence: Sequence, config: LogConfig) -> Finding | None:
+    """A reference whose level path is the mirror image of that by gyros and Doppler log; None where it is not."""
+    motion = BodyMotion.of(sequence)
+    truth = sequence.truth
+    if motion is None or truth is None:
+        return None
+    unknown_m2 = np.full((len(truth), 3, 3), np.nan)
+    places = PositionFixes(truth.stamps_ns, truth.positions, unknown_m2)
+    found = fix_match(replace(sequence, positions=places), motion)
+    if found is None or not found.gain.is_known or not found.is_mirrored:
+        return None
+    if found.misfit >= MOST_MISFIT:
+        return None
+    return contradiction(
+        "reference: path over that by gyros and Doppler log",
+        "it is its mirror image: north, east, down instead of east, north, up; all errors are of that",
+        f'{other_world(config, "truth")}, and `rotation = "frd"` where its orientations are of a body with z down; or the '
+        "fields of position in another order",
+        replace(found.gain, value=-abs(found.gain.value)),
+    )
+
+
+FEWEST_STATED = 20
+LARGEST_STATED = 20.0
+"""Stated sigma of velocities over their scatter from row to row, from which on it is in another unit."""
+SECOND_DIFFERENCE = float(np.sqrt(6.0))
+"""Sigma of ``v[k] - 2 v[k + 1] + v[k + 2]`` over that of v."""
+
+
+def stated_noise(dvl: Dvl) -> Finding | None:
+    """Stated sigma of velocities that exceeds their scatter and their size; None where it does not, or none is stated."""
+    variances = np.einsum("nii->ni", dvl.velocity_cov)
+    stated = np.isfinite(variances).all(axis=1)
+    if np.count_nonzero(stated) < FEWEST_STATED:
+        return None
+    velocity = dvl.velocity[stated]
+    sigma_m_s = float(np.sqrt(np.median(variances[stated])))
+    bent = np.abs(velocity[2:] - 2.0 * velocity[1:-1] + velocity[:-2])
+    # a median: steps and spikes are not noise
+    scatter_m_s = float(np.median(bent)) / (0.6745 * SECOND_DIFFERENCE)
+    size_m_s = float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
+    if sigma_m_s <= max(LARGEST_STATED * scatter_m_s, size_m_s):
+        return None
+    return contradiction(
+        "DVL noise: stated sigma",
+        f"{sigma_m_s:.2g} m/s, while successive velocities of {size_m_s:.2g} m/s scatter by {scatter_m_s:.2g} m/s: mm/s "
+        "instead of m/s?",
+        f"`covariance = false` under [dvl] {IN_LOG_CONFIG} uses `dvl.velocity_sigma_m_s` of the calibration",
+        "too large",
+    )
+
+
 def noise_findings(sequence: Sequence) -> Iterator[Finding]:
     """Noise densities of gyro and accelerometer, where the DVL confirms the rest: a steady drive can be as quiet."""
+    if (stated := stated_noise(sequence.dvl)) is not None:
+        yield stated
     found = noise_densities(sequence.imu)
     imu = sequence.calibration.imu
     speed = resting_speed(sequence)

@@ -383,11 +383,13 @@ class StartHeading:
     position_m: tuple[float, float, float]
     error: Estimate1D
     """Rad."""
+    allowed_rad: float
+    """Sigma that the calibration gives its heading."""
 
     @property
     def acts(self) -> bool:
         """True where the calibration's heading should be changed."""
-        return matters(self.error, LEAST_HEADING_RAD)
+        return matters(self.error, LEAST_HEADING_RAD, self.allowed_rad)
 
     def finding(self, tilt: StartTilt) -> Finding:
         """The row, with roll and pitch of the alignment if known, so that rows agree; else those of the reference."""
@@ -404,7 +406,7 @@ class StartHeading:
             line=f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` "
             f"{IN_CALIBRATION}; the position too is the reference's, so that both are of one pose",
         )
-        return judged(row, self.error, LEAST_HEADING_RAD)
+        return judged(row, self.error, LEAST_HEADING_RAD, allowed=self.allowed_rad)
 
 
 def find_start_heading(
@@ -426,7 +428,9 @@ def find_start_heading(
         turned_rad = float((begin.inv() * end).magnitude())
         turn_rate = turned_rad * NS_PER_S / (end_ns - begin_ns)
     spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
-    return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
+    of_error = Estimate1D(error, spread)
+    allowed_rad = sequence.calibration.start.rpy_sigma_rad[2]
+    return StartHeading((roll, pitch, yaw), (x, y, z), of_error, allowed_rad)
 
 
 def beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | None]:

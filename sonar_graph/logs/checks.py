@@ -307,11 +307,16 @@ def axis_doubts(
         return
     rate = imu.angular_velocity
     for fault in (
+        *two_sensors(rate, "angular rate", "imu"),
         *dead_axes(rate, "angular rate"),
         *clipped_axes(rate, "angular rate"),
     ):
         yield f"imu: {fault}: headings and positions are wrong from the first turn on"
-    faults = [*clipped_axes(dvl.velocity, "velocity"), *magnitudes(dvl.velocity)]
+    faults = [
+        *two_sensors(dvl.velocity, "velocity", "dvl"),
+        *clipped_axes(dvl.velocity, "velocity"),
+        *magnitudes(dvl.velocity),
+    ]
     if is_measured_in_full(depth, calibration):
         faults += dead_axes(dvl.velocity, "velocity", most=2)
     yield from (f"dvl: {fault}: positions are wrong" for fault in faults)
@@ -363,6 +368,8 @@ BURST_SHARE = 0.1
 LONGEST_BURST_S = 0.2
 """Stamps are off by half of it on average, more than a sensor's own delay."""
 FEWEST_FRESH = 100
+ALTERNATING = 1.6
+"""Mean change over one row over that over two, from which on rows alternate; of recordings up to 1.0, of noise 1."""
 FEWEST_VALUES = 50
 """Number of different values below which a sensor is too coarse to show where it is clipped."""
 FEWEST_CLIPPED = 5
@@ -377,6 +384,24 @@ def fresh_rows(values: Floats) -> Floats:
     """
     fresh = values[1:][differing(values)]
     return fresh if len(fresh) >= FEWEST_FRESH else fresh[:0]
+
+
+def two_sensors(values: Floats, quantity: str, role: str) -> Iterator[str]:
+    """A quantity, shape (n, 3), whose rows are of two sensors that take turns.
+
+    Differences over one row are as large as those over two where all is noise, and smaller where the signal is smooth.
+    """
+    fresh = fresh_rows(values)
+    if not len(fresh):
+        return
+    over_one = np.abs(fresh[1:] - fresh[:-1]).mean(axis=0)
+    over_two = np.abs(fresh[2:] - fresh[:-2]).mean(axis=0)
+    axis = int(np.argmax(over_one - ALTERNATING * over_two))
+    if over_one[axis] > ALTERNATING * over_two[axis]:
+        yield (
+            f"{quantity} along {'xyz'[axis]} changes by {over_one[axis]:.2g} from row to row, and by {over_two[axis]:.2g} "
+            f"over two rows: two sensors take turns on one topic; name another `topic` under [{role}], or record them apart"
+        )
 
 
 def dead_axes(values: Floats, quantity: str, most: int = 1) -> Iterator[str]:

@@ -6,6 +6,7 @@ was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md
 """
 
 import logging
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Never
@@ -481,7 +482,7 @@ class Assembly:
             body_R_sensor = self._heading_mounting().pose().rotation().matrix()
         origin = None
         if role in ("positions", "truth"):
-            origin, said = common_origin(self.adapters, self._tables)
+            origin, said = common_origin(role, self.adapters, self._tables)
             if said:
                 self._notes["log.origin"] = said
         return Setup(self.calibration, body_R_sensor, origin)
@@ -641,27 +642,34 @@ def row_notes(sequence: Sequence) -> dict[str, str]:
 
 
 def common_origin(
-    adapters: Mapping[str, Adapter], tables: Mapping[str, FieldTable]
+    role: str, adapters: Mapping[str, Adapter], tables: Mapping[str, FieldTable]
 ) -> tuple[Origin | None, str | None]:
     """Origin that fixes and true positions on the Earth share, in degrees and metres, and a note about it.
 
-    The configured one, or the first fix; None without any. Adapters and tables are by role.
+    The configured one, or the first fix; None without any. Heights that count from the first fix would contradict the
+    depths, which count from the surface: the height of the origin of fixes is NaN then, and theirs are not used. Adapters
+    and tables are by role.
     """
     of_earth: dict[str, GeodeticFields] = {}
-    for role in ("positions", "truth"):
-        fields = getattr(adapters.get(role), "geodetic", None)
-        if role in tables and fields is not None:
-            of_earth[role] = fields
+    for one in ("positions", "truth"):
+        fields = getattr(adapters.get(one), "geodetic", None)
+        if one in tables and fields is not None:
+            of_earth[one] = fields
     said = [fields.origin_deg_m for fields in of_earth.values() if fields.origin_deg_m]
-    fixes = (fields.first_fix(tables[role]) for role, fields in of_earth.items())
-    origin = next((one for one in (*said, *fixes) if one is not None), None)
+    fixes = [fields.first_fix(tables[one]) for one, fields in of_earth.items()]
+    origin = next((place for place in (*said, *fixes) if place is not None), None)
     if origin is None:
         return None, None
     latitude_deg, longitude_deg, height_m = origin
-    return origin, (
+    text = (
         f"of the world, x east, y north: latitude {latitude_deg:.8f}°, longitude {longitude_deg:.8f}°, height "
         f"{height_m:.3f} m, {'as configured' if said else 'the first fix'}"
     )
+    if said or "depth" not in adapters or "positions" not in of_earth:
+        return origin, text
+    of_fixes = (latitude_deg, longitude_deg, math.nan)
+    text += "; depths give the height, not the fixes, without `origin_deg_m` in geodetic under [positions]"
+    return of_fixes if role == "positions" else origin, text
 
 
 def rows_of(

@@ -46,8 +46,8 @@ POSE_FIELDS = tuple(
 )
 FrameTree = dict[str, tuple[str, gtsam.Pose3 | str]]
 """Parent and ``parent_T_frame`` of each frame; instead of a pose the fault of one that cannot be."""
-LARGEST_LEVER_M = 1000.0
-"""No vehicle is as long."""
+LARGEST_LEVER_M = 50.0
+"""No underwater vehicle is as long; in millimetres most levers are."""
 Values = Mapping[str, Any]
 OPTIONAL = {name for name, value in Calibration().model_dump().items() if value is None}
 """Fields of a calibration that may be absent."""
@@ -127,7 +127,7 @@ def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
         lever_m = math.hypot(*body_T_sensor.translation())
         # also where it is NaN
         if not lever_m < LARGEST_LEVER_M:
-            raise LogError(f"is {lever_m:g} m from {BODY_FRAME}")
+            raise LogError(f"is {lever_m:g} m from {BODY_FRAME}: millimetres?")
     except LogError as error:
         advice = "state the sensor's mounting in a file for --calibration"
         raise LogError(f"/tf_static: {frame}: {error}; {advice}") from None

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PositionCalibration
 from sonar_graph.diagnosis import check_sensors
@@ -18,6 +19,7 @@ from sonar_graph.measurements import (
     PositionFixes,
 )
 from sonar_graph.sequence import Sequence
+from sonar_graph.states import Trajectory
 
 from .test_turn_rate import T, level_drive
 
@@ -91,6 +93,11 @@ FAULTS: dict[str, tuple[Callable[[], Sequence], str, float]] = {
         "heading: deviation with the heading",
         10.0,
     ),
+    "compass beside soft iron": (
+        lambda: observed(yaw_rad=YAW + np.radians(10.0) * np.sin(2.0 * YAW + 0.4)),
+        "heading: deviation with the heading",
+        10.0,
+    ),
     "current": (
         lambda: observed(path=PATH + (0.3 + 0.2j) * T),
         "position fixes: current",
@@ -108,6 +115,53 @@ def test_a_cause_is_named_with_its_size_and_nothing_else_is_blamed(fault: str):
     assert estimate.value == pytest.approx(
         size, abs=max(0.15 * size, 4 * estimate.sigma)
     )
+
+
+@pytest.mark.parametrize(("size_deg", "is_named"), [(25.0, True), (8.0, False)])
+def test_a_compass_that_leaves_the_gyros_for_a_while_is_named(size_deg, is_named):
+    bump = np.radians(size_deg) * np.exp(-0.5 * ((T - 40.0) / 6.0) ** 2)
+    found = [
+        f
+        for f in check_sensors(observed(yaw_rad=YAW + bump))
+        if "excursion" in f.quantity
+    ]
+    assert bool(found) == is_named
+    if found:
+        assert found[0].grave
+        assert re.search(r"by up to [12]\d° between 3\d and 4\d s", found[0].advice)
+
+
+def truth_of(run: Sequence, turned: np.ndarray) -> Sequence:
+    """The true path, its coordinates turned or mirrored by a matrix."""
+    places = np.column_stack([PATH.real, PATH.imag, DIVE]) @ turned.T
+    level = Rotation.from_euler("z", YAW[:, None]).as_quat()
+    path = Trajectory.without_covariances(run.imu.stamps_ns, places, level)
+    return replace(run, truth=path)
+
+
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@pytest.mark.parametrize(("turned", "is_named"), [(NED, True), (np.eye(3), False)])
+def test_a_reference_in_north_east_down_is_named(turned, is_named):
+    found = check_sensors(truth_of(observed(), turned))
+    named = [f for f in found if "mirror image" in f.cause]
+    assert bool(named) == is_named
+    if named:
+        assert named[0].grave
+        assert '`world = "ned"` under [truth]' in named[0].line
+    else:
+        assert not any(f.grave for f in found)
+
+
+@pytest.mark.parametrize(("sigma_m_s", "is_named"), [(10.0, True), (0.5, False)])
+def test_a_stated_noise_of_velocities_in_another_unit_is_named(sigma_m_s, is_named):
+    run = observed()
+    noisy = run.dvl.velocity + 0.01 * NOISE[: len(run.dvl)]
+    stated = np.tile(sigma_m_s**2 * np.eye(3), (len(run.dvl), 1, 1))
+    dvl = replace(run.dvl, velocity=noisy, velocity_cov=stated)
+    found = check_sensors(replace(run, dvl=dvl))
+    assert any("stated sigma" in f.quantity for f in found if f.grave) == is_named
 
 
 JUMPS = {

@@ -194,6 +194,20 @@ def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
     )
 
 
+def test_a_start_heading_within_its_own_sigma_is_not_wrong():
+    roll, pitch, yaw = start_of(SHORT, SHORT.truth)
+    run = started_at(SHORT, roll, pitch, yaw + 0.1)
+    start = run.calibration.start
+    for sigma_rad, acts in ((0.001, True), (0.1, False)):
+        sigmas = (*start.rpy_sigma_rad[:2], sigma_rad)
+        loose = start.model_copy(update={"rpy_sigma_rad": sigmas})
+        calibration = run.calibration.model_copy(update={"start": loose})
+        found = by_name(
+            sensor_check.check_sensors(replace(run, calibration=calibration))
+        )
+        assert found["start heading: error"].acts == acts
+
+
 def test_a_number_that_cannot_be_told_asks_for_nothing():
     short = replace(
         RIGHT,

@@ -28,6 +28,7 @@ from sonar_graph.logs.checks import (
     stuck_doubt,
     stuck_rows,
     stuck_warning,
+    two_sensors,
     unlikely_zeros,
 )
 from sonar_graph.logs.reading import require_use, unsaid_noise
@@ -390,6 +391,18 @@ def test_an_axis_that_is_dead_or_clipped_is_named_and_no_other(seed):
     low, high = clipped_axes(rates(seed, clip=0.2), "angular rate")
     assert low.startswith("angular rate along z is never beyond -0.2")
     assert high.startswith("angular rate along z is never beyond 0.2")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_sensors_that_take_turns_on_a_topic_are_named(seed):
+    values = rates(seed)
+    noisy = values + 0.1 * np.random.default_rng(seed).standard_normal(values.shape)
+    assert not list(two_sensors(values, "angular rate", "imu"))
+    assert not list(two_sensors(noisy, "angular rate", "imu"))
+    turned = values[:, [1, 0, 2]] * [1.0, -1.0, 1.0]
+    both = np.where(np.arange(len(values))[:, None] % 2, values, turned)
+    (text,) = two_sensors(both, "angular rate", "imu")
+    assert "two sensors take turns on one topic" in text
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -126,6 +126,7 @@ TRANSLATION = "numbers that are not finite"
         ("rotation", np.inf, TRANSLATION),
         ("rotation", 0.0, ROTATION + "0"),
         ("translation", 1e300, r"dvl: is .* m from base_link"),
+        ("translation", 350.0, r"dvl: is .* m from base_link: millimetres"),
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(

@@ -246,10 +246,11 @@ class GeodeticFields(PathSection):
         return latitude, longitude, next(iter(heights), 0.0)
 
     def positions(self, table: FieldTable, origin: Origin | None) -> Places:
-        """Metres east, north, up of an origin."""
+        """Metres east, north, up of an origin; without heights where its own is NaN."""
         places, is_fix = self.read(table)
-        start = origin or (0.0, 0.0, 0.0)
-        has_height = np.isfinite(places[:, 2])
+        latitude_deg, longitude_deg, level_m = origin or (0.0, 0.0, 0.0)
+        has_height = np.isfinite(places[:, 2]) & np.isfinite(level_m)
+        start = (latitude_deg, longitude_deg, float(np.nan_to_num(level_m)))
         # rows without a fix are left out, and a height that was not measured counts as 0
         is_known = np.column_stack([is_fix, is_fix, has_height])
         latitude, longitude, height_m = np.where(is_known, places, start).T

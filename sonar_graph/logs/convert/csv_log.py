@@ -227,7 +227,7 @@ def _measurements(
     """Measurements by role, and notes about what was assumed, left out, and looks wrong."""
     calibration = Calibration()
     adapters = {role: one.adapter for role, one in roles.items()}
-    origin, about_origin = common_origin(adapters, tables)
+    _, about_origin = common_origin("positions", adapters, tables)
     notes = {"log.origin": about_origin} if about_origin else {}
     blocks: dict[str, Any] = {}
     left_out: list[str] = []
@@ -237,6 +237,7 @@ def _measurements(
         if assumed := adapter.assumption(calibration.gravity_m_s2):
             notes["log.depth"] = assumed
         # axes of the vehicle: a mounting is of the calibration, which tables do not have
+        origin, _ = common_origin(role, adapters, tables)
         rows, dropped = rows_of(adapter, table, calibration, np.eye(3), origin)
         faults = [f"{count} {fault}" for fault, count in dropped.items()]
         if rows is None:

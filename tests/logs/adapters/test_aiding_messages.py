@@ -75,6 +75,11 @@ def points(*places: tuple[float, float, float], topic: str = "/usbl/point") -> E
     return rows_of(topic, POINT, [{"point": vector(*place)} for place in places])
 
 
+def pressures(*values: float) -> Entry:
+    rows = [{"fluid_pressure": value} for value in values]
+    return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=0.0)
+
+
 YAW = Rotation.from_euler("z", 0.5)
 NED_NORTH_WEST = Rotation.from_euler("ZYX", [np.radians(-45), 0.1, 0.2])
 OFFSET = "[heading]\nyaw_offset_rad = 0.25"
@@ -142,6 +147,11 @@ EARTH: dict[str, Case] = {
         {"positions.position_m": [[0, 0, 0], [0, 10, 2]], "positions.covariance_m2": [np.reshape(SQUARE, (3, 3))] * 2,
          "calibration.positions.antenna_m": (1, 2, 3)},
         {"log.origin": "latitude 0.00100000°, longitude 7.00000000°, height 20.000 m, the first fix"}),
+    "depths give the height of fixes without an origin": (
+        [fixes(fix(), fix(10.0, altitude=22.0)), pressures(1.3e5, 1.31e5)], "",
+        {"positions.position_m": [[0, 0, 0], [0, 10, 0]], "positions.covariance_m2": [
+            [[4, 1, 0], [1, 9, 0], [0, 0, UNMEASURED_M2]]] * 2},
+        {"log.origin": "the first fix; depths give the height, not the fixes"}),
     "origin that is said": (
         [fixes(fix(10.0))], BY_EAST, {"positions.position_m": [[0, 10, 5]]}, {"log.origin": "as configured"}),
     "no fix": (
