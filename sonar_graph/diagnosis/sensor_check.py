@@ -290,13 +290,18 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     is_sound = not any(finding.grave for finding in by_motion)
     of_map = list(map_findings(right)) if is_sound else []
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
-    if of_dvl[0].acts and (role := drifting_role(sequence)):
+    of_stamps = [f for f in [of_dvl[0], *by_motion, *reference] if is_delay(f)]
+    if any(f.acts for f in [*of_stamps, *tilting]) and (
+        role := drifting_role(sequence)
+    ):
         cause = f"stamps of [{role}] drift from the times of recording, or jump"
         line = f'`stamp = "log"` under [{role}] {IN_LOG_CONFIG}'
-        of_dvl[0] = replace(of_dvl[0], cause=cause, line=line)
+        of_dvl[0] = replace(of_dvl[0], cause=cause, line=line, gravity=Gravity.GRAVE)
         lever = [Finding(ARM, unknown("the stamps drift"), "m")]
-        # other sensors look late as well
-        by_motion = [f for f in by_motion if not f.quantity.endswith(": delay")]
+        # other sensors look late as well, and forces at other times are a bias
+        axes = [f for f in axes if f not in tilting]
+        by_motion = [f for f in by_motion if not is_delay(f)]
+        reference = [f for f in reference if not (is_delay(f) and f.acts)]
     of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
     return [
         *forces,
@@ -335,6 +340,11 @@ def spoilt_by(sequence: Sequence) -> str:
     mounting = calibration.imu.mounting
     gravity = gravity_warning(force, mounting, calibration.gravity_m_s2) or ""
     return gravity if OTHER_WAYS in gravity or FELT_ALONG in gravity else ""
+
+
+def is_delay(finding: Finding) -> bool:
+    """True for rows on the stamps of a sensor against those of another."""
+    return finding.quantity.endswith((": delay", ": time offset"))
 
 
 def drifting_role(sequence: Sequence) -> str:

@@ -551,3 +551,16 @@ def test_a_mounting_that_is_not_known_is_named_before_what_may_follow_from_it(
     grave = [f.quantity for f in sensor_check.check_sensors(run) if f.grave]
     assert bool(grave) == is_wrong
     assert (grave[:1] == ["mountings"]) == (is_wrong and not is_placed)
+
+
+@pytest.mark.parametrize("drift", [0.003, 0.03])
+def test_imu_stamps_of_a_wrong_clock_have_one_line(drift: float) -> None:
+    """All other sensors look late, each by another time."""
+    imu = SHORT.imu
+    since_ns = imu.stamps_ns - imu.stamps_ns[0]
+    fast = replace(imu, stamps_ns=imu.stamps_ns + (drift * since_ns).astype(np.int64))
+    note = {"log.stamps": "imu: stamps and recording drift apart by 2 s: a clock"}
+    found = sensor_check.check_sensors(replace(SHORT, imu=fast, notes=note))
+    first, *others = [f for f in found if f.acts]
+    assert '`stamp = "log"` under [imu]' in first.line
+    assert not any("stamp_offset_s" in f.line for f in others)
