@@ -166,9 +166,8 @@ def test_fixes_faster_than_any_vehicle_are_found_and_outliers_are_not(
         given = replace(good, positions=replace(good.positions, position_m=wrong))
         found = [f.quantity for f in position_findings(given, NO_CONFIG) if f.acts]
         assert ("position fixes: jumps" in found) == is_named, (found, every_s)
-        assert [
-            f.quantity for f in check_sensors(given) if "jumps" in f.quantity
-        ] == found
+    # the last one, by the whole comparison
+    assert [f.quantity for f in check_sensors(given) if "jumps" in f.quantity] == found
 
 
 def yaw_of(run: Sequence) -> np.ndarray:
