@@ -123,6 +123,7 @@ def _lines_below(comparison: Comparison) -> list[str]:
     lines += [
         *sentences.doubt_of_identities(comparison),
         *sentences.outliers(comparison),
+        *sentences.shared_error(comparison),
     ]
     lines += sentences.nameless_landmarks(comparison)
     if comparison.recognition is not None:

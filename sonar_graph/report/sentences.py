@@ -52,6 +52,8 @@ OUTLYING_SHARE = 0.05
 # correlation of the innovations of successive sightings from which they are named, and the fewest pairs of sightings
 ALIKE = 0.5
 FEWEST_PAIRS = 100
+# error of runs over their distance from each other and their sigmas, from which on something that they share is wrong
+SHARED_TIMES = 5.0
 # factor of a sigma from which it is said
 LEAST_FACTOR = 1.5
 # findings about the reference, which no estimator uses
@@ -113,6 +115,7 @@ def doubts(comparison: Comparison) -> list[str]:
         *doubtful[1:],
         *doubt_of_identities(comparison),
         *outliers(comparison),
+        *shared_error(comparison),
         *alike_errors(comparison),
         *(line for line in warning_lines(notes) if line not in doubtful),
         *withheld_lines(comparison),
@@ -378,6 +381,38 @@ def outliers(comparison: Comparison) -> list[str]:
     return [
         f"{WARNING}: sonar, detections that were used although as far off as one in a billion should be: "
         f"{'; '.join(said)}: look at their ranges, azimuths and identities, then at noise and start"
+    ]
+
+
+def shared_error(comparison: Comparison) -> list[str]:
+    """A warning where runs that used landmarks agree with each other, and not with the truth that they are aligned to."""
+    used = {}
+    for run in comparison.runs:
+        error = comparison.scores[run.estimator].get("causal.ate_se2_m")
+        errors = comparison.errors.get(run.estimator, {}).get("causal")
+        outcomes = run.detections.outcomes if run.detections else []
+        if error is not None and errors is not None and Outcome.USED in outcomes:
+            used[run.estimator] = (error.value, errors)
+    if len(used) < 2:
+        return []
+    error_m = min(value for value, _ in used.values())
+    (_, first), *others = used.values()
+    apart_m = 0.0
+    for _, other in others:
+        if not np.array_equal(first.stamps_ns, other.stamps_ns):
+            return []
+        between = (other.position_m - first.position_m)[:, :2]
+        apart_m = max(apart_m, float(np.sqrt(np.mean(np.sum(between**2, axis=1)))))
+    sigmas_m = [
+        np.nanmedian(np.linalg.norm(errors.position_sigma_m[:, :2], axis=1))
+        for _, errors in used.values()
+    ]
+    if not error_m > SHARED_TIMES * max(apart_m, *sigmas_m):
+        return []
+    return [
+        f"{WARNING}: {', '.join(used)} agree to {apart_m:.2g} m, and are {error_m:.2g} m off the truth they are aligned "
+        "to: the truth is of another point of the vehicle or in another frame, or what they share is wrong (Doppler log, "
+        "mountings, calibration)"
     ]
 
 

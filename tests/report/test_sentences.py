@@ -536,3 +536,30 @@ def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_
     assert said(0.8, notes={"log.doubtful": "depth against dvl: sign"}) == []
     assert said(0.8, notes={"log.sensors": "dvl against imu: scale"}) == []
     assert len(said(0.8, notes={"log.sensors": "reference against IMU: late"})) == 1
+
+
+@pytest.mark.parametrize(("off_m", "is_said"), [(2.0, True), (0.0, False)])
+def test_runs_that_agree_with_each_other_and_not_with_the_truth_share_a_fault(
+    off_m, is_said
+):
+    comparison = basin_comparison(60)
+    names = [run.estimator for run in comparison.runs if run.detections is not None]
+    for name in names:
+        errors = comparison.errors[name]["causal"]
+        same = replace(errors, position_m=np.full_like(errors.position_m, off_m))
+        comparison = with_score(
+            comparison, name, "causal.ate_se2_m", Score(off_m, "m", "By hand.")
+        )
+        both = comparison.errors[name] | {"causal": same}
+        comparison = replace(comparison, errors=comparison.errors | {name: both})
+    said = sentences.shared_error(comparison)
+    assert bool(said) == is_said
+    if said:
+        assert "agree to 0 m, and are 2 m off the truth" in said[0]
+        # estimators that differ have faults of their own
+        name = names[0]
+        errors = comparison.errors[name]["causal"]
+        apart = replace(errors, position_m=errors.position_m + 1.0)
+        both = comparison.errors[name] | {"causal": apart}
+        other = replace(comparison, errors=comparison.errors | {name: both})
+        assert sentences.shared_error(other) == []
