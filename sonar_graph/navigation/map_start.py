@@ -83,6 +83,10 @@ LINEAR_SIGMAS = 3.0
 LOOSER = 3.0
 """Sigmas of the prior start over those found: the estimator weighs the same sightings itself, so that a ninth of their
 information counts twice. With a looser prior it would follow a moved landmark that it sees first."""
+SELDOM = 8
+"""Number of its sightings up to which each one of a landmark is news; after that their mean changes little."""
+NEWS_SHARE = 0.05
+"""Share of all sightings that is news together: a map that never fits would be compared with each frame of a long dive."""
 VERTICAL_M_S = 0.5
 """Vertical speed that a depth may have missed since it was measured."""
 LEAST_RISE = 0.05
@@ -150,6 +154,8 @@ class MapLocator:
         """Identities of the landmarks that have moved, by the start that was found."""
         self._refuted: FoundStart | None = None
         """Last start from which most landmarks stand elsewhere than in the map."""
+        self._given_up = 0
+        """Number of starts that were in use before they were refuted."""
         self._calibration = calibration
         self.map = calibration.map
         self._places = np.array(self.map.positions_m)
@@ -159,6 +165,10 @@ class MapLocator:
         self._found_ns: list[int] = []
         """Frames at which the start was found, and found again."""
         self.sightings: list[MapSighting] = []
+        self._times_seen: Counter[int] = Counter()
+        """Number of sightings, by row of the map."""
+        self._weighed = 0
+        """Number of sightings when they were weighed last."""
         self._others: set[int] = set()
         """Identities that were seen and are not in the map."""
         sonar = calibration.sonar
@@ -173,6 +183,8 @@ class MapLocator:
         for stamp_ns in self.frames_seen(measurements):
             if not self.is_watching(stamp_ns):
                 return
+            if not self._is_due():
+                continue
             of_all = newest_of_each(self.sightings, MOST_OF_LANDMARK)
             data = map_data(of_all, self.map)
             self._give_up_if_refuted(data)
@@ -182,13 +194,22 @@ class MapLocator:
             if self.found is not None and not outweighs(best, self.found, data):
                 continue
             moved = moved_landmarks(best, data)
-            # a few fit a mirror image, or a map of another place, by chance
-            if len(moved) >= len(best.agreeing):
+            # a few fit a mirror image, or a map of another place, by chance; each new start repeats the run until now
+            if len(moved) * (1 + self._given_up) >= len(best.agreeing):
                 self._refuted = best
                 continue
             self.found = best
             self._found_ns.append(stamp_ns)
             self.moved = [self.map.ids[row] for row in moved]
+
+    def _is_due(self) -> bool:
+        """True at a frame with news: a landmark that was seldom seen, or many sightings since the last one."""
+        since = self.sightings[self._weighed :]
+        is_new = any(self._times_seen[each.row] <= SELDOM for each in since)
+        if not is_new and len(since) < NEWS_SHARE * len(self.sightings):
+            return False
+        self._weighed = len(self.sightings)
+        return True
 
     def _give_up_if_refuted(self, data: "MapData") -> None:
         """Forget a start from which as many landmarks stand elsewhere by now as agree."""
@@ -199,6 +220,7 @@ class MapLocator:
         if start is None or len(moved_landmarks(start, data)) < len(start.agreeing):
             return
         self._refuted = start
+        self._given_up += 1
         self.found = None
         self.moved = []
 
@@ -301,6 +323,7 @@ class MapLocator:
             # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
             is_in_view = elevation_rad is not None and abs(elevation_rad) <= half_rad
             self.sightings.append(MapSighting(row, point[:2], S, is_in_view))
+            self._times_seen[row] += 1
         return True
 
     def _at_depth(self, body: BodyInFrame, stamp_ns: int) -> BodyInFrame:
