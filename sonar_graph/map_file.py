@@ -34,9 +34,7 @@ from sonar_graph.states import counted
 PLACE = ("x_m", "y_m", "z_m")
 SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 TRIANGLE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-COLUMNS = (
-    f"id, {', '.join(PLACE)} and sigma_m, {', '.join(SIGMAS)} or {', '.join(TRIANGLE)}"
-)
+COLUMNS = f"id, {', '.join(PLACE)} and either sigma_m, or {', '.join(SIGMAS)}, or {', '.join(TRIANGLE)}"
 MOST_M = 1e5
 """A coordinate beyond it is in another unit, or of a grid of a country."""
 FROM_NEAR_BY = "give metres from an origin near by, along the world's axes"
@@ -75,7 +73,9 @@ def read_map(path: Path) -> ReadMap:
         try:
             values = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise LogError(f"{path}: {error}") from error
+            raise LogError(
+                f"{path}: {error}; a table of a survey has a name that ends in .csv"
+            ) from error
         known = parse(KnownMap, values, str(path), LogError)
     else:
         known, is_marginal = of_table(text, path)
@@ -113,8 +113,10 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
     ):
         # spreadsheets of some countries write semicolons
         apart = "; separate them by commas" if ";" in text.partition("\n")[0] else ""
+        missing = [name for name in ("id", *PLACE) if name not in heads] or ["a sigma"]
+        lacking = "" if len(missing) > 2 else f"{' and '.join(missing)} is missing: "
         raise LogError(
-            f"{path}: expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}{apart}"
+            f"{path}: {lacking}expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}{apart}"
         )
     if has_axes < bool(set(SIGMAS) & set(heads)):
         raise LogError(f"{path}: expected all of {', '.join(SIGMAS)}, or sigma_m alone")

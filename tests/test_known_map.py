@@ -652,7 +652,9 @@ def test_landmarks_that_moved_are_no_exchanged_identities(dive):
     places = np.array(known.positions_m)
     places[:2, 0] += 3.0
     moved = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
-    assert not [f for f in map_findings(with_map(dive, moved)) if f.acts]
+    (finding,) = [f for f in map_findings(with_map(dive, moved)) if f.acts]
+    assert finding.quantity == "map: landmarks elsewhere"
+    assert finding.cause.startswith("1, 2 are seen") or finding.cause.startswith("1..2")
 
 
 @pytest.mark.parametrize(
@@ -751,7 +753,7 @@ HEAD = "id,x_m,y_m,z_m,sigma_m\n"
 BAD = {
     "no columns": (
         "id,x_m\n1,2\n",
-        "expected the columns id, x_m, y_m, z_m and sigma_m",
+        "y_m and z_m is missing: expected the columns id, x_m, y_m, z_m and either sigma_m",
     ),
     "empty": (HEAD, "no landmark: give a line for each"),
     "a word": (HEAD + "1,a,2,3,0.1\n", "line 2: x_m: expected a number, not 'a'"),

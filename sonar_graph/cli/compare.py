@@ -410,15 +410,15 @@ def print_outcome(comparison: Comparison, place: str) -> None:
 
     Exit with 1 if a run failed, with the reason, and with 3 if sensors contradict each other beyond doubt.
     """
-    from sonar_graph.report import doubtful_lines, summary
+    from sonar_graph.report import doubtful_lines, failed_lines, summary
 
     out = answers()
     out.print(summary(comparison))
     echo(place)
     # results are written all the same: the others may be what was wanted
-    failed = [run for run in comparison.runs if run.status == "failed"]
-    for run in failed:
-        echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
+    failed = failed_lines(comparison)
+    for line in failed:
+        echo(f"sonar-graph: {line}", err=True)
     if failed:
         raise typer.Exit(1)
     if doubtful_lines(comparison):

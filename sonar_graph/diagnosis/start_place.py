@@ -101,7 +101,18 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         )
         agreeing = [known.ids[row] for row in fit.start.agreeing]
         fits = f"the sightings of landmarks {listed(agreeing)} fit the map, {NO_NEED}"
+        if others := named.difference(known.ids):
+            fits += f"; not in it: {listed(others)}"
         yield Finding("map: yaw of the start in it", in_degrees(turn), "°", fits)
+    if fit.elsewhere:
+        yield Finding(
+            "map: landmarks elsewhere",
+            unknown("they moved"),
+            cause=f"{listed(fit.elsewhere)} are seen several times in another place than the map has them: moved, or wrong "
+            "lines of the survey",
+            line="correct these lines of the map, or leave them out",
+            gravity=Gravity.ACT,
+        )
     start = right.calibration.start
     if fit.start is None or start.source == "map":
         return

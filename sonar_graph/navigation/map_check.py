@@ -18,6 +18,7 @@ import numpy as np
 from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Measurements
 from sonar_graph.navigation.map_start import (
+    MOST_OF_LANDMARK,
     ODDS,
     FoundStart,
     MapLocator,
@@ -25,6 +26,7 @@ from sonar_graph.navigation.map_start import (
     candidates,
     located,
     map_data,
+    moved_landmarks,
     newest_of_each,
 )
 from sonar_graph.sequence import Sequence
@@ -76,6 +78,8 @@ class MapFit(NamedTuple):
     """Change of the map that undoes it."""
     is_checked: bool = True
     """False where fewer than `FEWEST` landmarks were seen, and nothing else shows a mistake."""
+    elsewhere: tuple[int, ...] = ()
+    """Identities of landmarks that stand elsewhere than in the map, seen from the start."""
 
 
 def map_fit(sequence: Sequence) -> MapFit:
@@ -112,7 +116,9 @@ def map_fit(sequence: Sequence) -> MapFit:
     if swaps:
         return MapFit(None, *of_swaps(swaps))
     if start is not None:
-        return MapFit(start)
+        data = map_data(newest_of_each(given.sightings, MOST_OF_LANDMARK), known)
+        moved = moved_landmarks(start, data)
+        return MapFit(start, elsewhere=tuple(sorted(known.ids[row] for row in moved)))
     looser = known.model_copy(
         update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
     )

@@ -257,7 +257,7 @@ def withheld_told(batch: RecordedBatch) -> list[str]:
                 run.contestant
             )
     lines = [
-        f"Warning: {log}: {', '.join(dict.fromkeys(names))}: {text}"
+        f"{'Doubtful' if 'beyond doubt' in text else 'Warning'}: {log}: {', '.join(dict.fromkeys(names))}: {text}"
         for (log, text), names in found.items()
     ]
     lines.sort(key=lambda line: "beyond doubt" not in line)

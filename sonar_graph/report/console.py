@@ -105,7 +105,7 @@ def summary(comparison: Comparison) -> Group:
 
 def _lines_below(comparison: Comparison) -> list[str]:
     """Failures, warnings about the log, warnings of runs that may follow from these, and the meaning of the columns."""
-    lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    lines = sentences.failed_lines(comparison)
     # first, as the numbers above are not to be relied on
     doubtful = sentences.doubtful_lines(comparison)
     lines += doubtful

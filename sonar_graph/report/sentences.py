@@ -68,6 +68,9 @@ UNKNOWN = "identity.unknown.policy"
 WARNING = "Warning"
 DOUBTFUL = "Doubtful"
 BEYOND = "beyond doubt"
+CONTRADICTED = "sightings contradict the map"
+# sigma of a start in a map, from which on wrong first sightings lead far away
+LOOSE_START_M = 1.0
 # ratio of squared innovations to their covariance, typical of a sensor, that no noise makes
 BEYOND_DOUBT = 100.0
 # notes that the terminal shows, and the word before each, causes first; the report has all notes
@@ -99,11 +102,15 @@ def remarks(comparison: Comparison) -> list[str]:
 
 def grave_lines(comparison: Comparison) -> list[str]:
     """Sentences on runs that failed or lost their way."""
-    failed = [
-        f"{run.estimator} failed: {run.reason.rstrip('.')}."
-        for run in comparison.failed_runs
-    ]
-    return [*failed, *lost_runs(comparison)]
+    return [*failed_lines(comparison), *lost_runs(comparison)]
+
+
+def failed_lines(comparison: Comparison) -> list[str]:
+    """A sentence for each reason for which runs failed."""
+    names: dict[str, list[str]] = {}
+    for run in comparison.failed_runs:
+        names.setdefault(run.reason.rstrip("."), []).append(run.estimator)
+    return [f"{', '.join(own)} failed: {reason}." for reason, own in names.items()]
 
 
 def doubts(comparison: Comparison) -> list[str]:
@@ -643,12 +650,16 @@ def withheld_lines(comparison: Comparison) -> list[str]:
     calibration = comparison.sequence.calibration
     start_sigma_m = max(calibration.start.position_sigma_m[:2])
     is_stated = calibration.start.source != "map"
-    if is_stated and calibration.map and any(MOVED in message for message in said):
+    is_doubted = start_sigma_m > LOOSE_START_M or any(
+        MOVED in message or CONTRADICTED in message for message in said
+    )
+    if is_stated and calibration.map and is_doubted:
         map_sigma_m = math.sqrt(np.diag(calibration.map.joint()).max())
         # the first landmark that is seen corrects such a start, and if it is the one that moved, others seem to have moved
         if start_sigma_m > map_sigma_m:
             lines.append(
-                f"{WARNING}: the start is less certain ({start_sigma_m:.2g} m) than the map ({map_sigma_m:.2g} m): if it is "
-                'off, the wrong landmarks may count as moved; `source = "map"` under [start] finds it by all landmarks'
+                f"{WARNING}: the start is less certain ({start_sigma_m:.2g} m) than the map ({map_sigma_m:.2g} m): first "
+                "sightings decide; if they are wrong, so is the pose, and other landmarks seem to have moved; "
+                '`source = "map"` under [start] finds it by all landmarks'
             )
     return lines

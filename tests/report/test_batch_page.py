@@ -119,7 +119,7 @@ def test_what_estimators_withheld_is_told_once_for_each_log():
     ]
     batch = replace(drawn, runs=runs)
     assert withheld_told(batch) == [
-        f"Warning: {LOGS[0]}: isam2: {grave}",
+        f"Doubtful: {LOGS[0]}: isam2: {grave}",
         f"Warning: {LOGS[0]}: isam2: {moved}",
     ]
     assert f"{LOGS[0]}: isam2: {moved}" in render_batch(batch)
