@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound="Section")
 # columns of output that does not go to a terminal, so that lines stay whole
-FILE_WIDTH = 200
+FILE_WIDTH = 2000
 
 
 def existing_file(meaning: str, metavar: str = "FILE") -> Any:

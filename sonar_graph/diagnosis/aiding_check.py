@@ -296,8 +296,10 @@ DEPTH = Check(
     step_unit="m",
     units=LENGTHS | PRESSURES,
     sense=lambda config: Advice(
-        "it rises where the vehicle sinks by the Doppler log: depths downwards, or an altimeter?",
-        f"{scale_line('depth', 'scale', config, -1.0)}; an altimeter is no depth: `use = false` under [depth]",
+        "it rises where the vehicle sinks by the Doppler log: depths downwards, an altimeter, or the Doppler log has the "
+        "wrong sense along z?",
+        f"{scale_line('depth', 'scale', config, -1.0)}; an altimeter is no depth: `use = false` under [depth]; "
+        f"`rotation` under [dvl] turns its axes",
     ),
     scaled=lambda config, gain: Advice(
         "",
