@@ -114,7 +114,7 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
         # spreadsheets of some countries write semicolons
         apart = "; separate them by commas" if ";" in text.partition("\n")[0] else ""
         missing = [name for name in ("id", *PLACE) if name not in heads] or ["a sigma"]
-        lacking = "" if len(missing) > 2 else f"{' and '.join(missing)} is missing: "
+        lacking = "" if len(missing) > 2 else f"{' and '.join(missing)}: missing: "
         raise LogError(
             f"{path}: {lacking}expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}{apart}"
         )

@@ -339,7 +339,8 @@ def test_a_place_is_as_uncertain_as_range_azimuth_pose_and_heights_make_it(
     ray = Ray(8.0, 0.3, elevation_rad)
     floor_z = locate(o_T_body.compose(body_T_sonar), *ray)[2]
     sigmas = np.array([0.01, 0.01, 0.01, 0.03, 0.03, 0.03])
-    height_m, floor_m = 0.05, 0.08
+    height_m = 0.05
+    floor_m = 0.08
     R_z = np.diag([0.03**2, 0.01**2])
     body = BodyInFrame(o_T_body, np.diag(sigmas**2), height_m**2)
     S = spread(body, o_T_body.compose(body_T_sonar), ray, R_z, floor_m**2)
@@ -753,7 +754,7 @@ HEAD = "id,x_m,y_m,z_m,sigma_m\n"
 BAD = {
     "no columns": (
         "id,x_m\n1,2\n",
-        "y_m and z_m is missing: expected the columns id, x_m, y_m, z_m and either sigma_m",
+        "y_m and z_m: missing: expected the columns id, x_m, y_m, z_m and either sigma_m",
     ),
     "empty": (HEAD, "no landmark: give a line for each"),
     "a word": (HEAD + "1,a,2,3,0.1\n", "line 2: x_m: expected a number, not 'a'"),

@@ -331,7 +331,8 @@ def excursion(found: Match, least: float) -> str:
         if is_off.any() and is_off.mean() <= MOST_OFF:
             rows = np.flatnonzero(is_off)
             largest_deg = np.degrees(off[np.abs(off).argmax()])
-            begin_s, end_s = middle_s[rows[[0, -1]]]
+            begin_s = middle_s[rows[0]]
+            end_s = middle_s[rows[-1]]
             return (
                 f"by up to {largest_deg:.2g}° between {begin_s:.0f} and {end_s:.0f} s"
             )

@@ -158,8 +158,8 @@ CAUSES = {
     "heading": "headings contradict its yaw by more than {:g} sigma: gyro noise, gyro bias or start larger than the "
     "calibration says, or headings worse than heading.sigma_rad?",
     "positions": "position fixes contradict its position by more than {:g} sigma: noise of gyros or Doppler log, or "
-    "the start, larger than the calibration says, or fixes worse than positions.sigma_m, or than the log's covariances, "
-    "which `covariance = false` under [positions] leaves out?",
+    "the start, larger than the calibration says, or fixes worse than positions.sigma_m, or than their own "
+    "covariances?",
 }
 """Rest of the message about a sensor that an estimator contradicts, after the number of rows."""
 

@@ -109,7 +109,8 @@ def test_logs_whose_data_was_absent_are_named_with_their_source():
 
 
 def test_what_estimators_withheld_is_told_once_for_each_log():
-    moved, grave = "moved since the map was made: landmark 3", "beyond doubt"
+    moved = "moved since the map was made: landmark 3"
+    grave = "beyond doubt"
     drawn = drawn_batch(2)
     runs = [
         replace(run, texts=run.texts | {"withheld": grave if run.seed else moved})
