@@ -779,7 +779,8 @@ def results(log: SoundLog, folder: Path, rng: Rng) -> Case:
     return Case(
         "results",
         ["report", str(out)] if rng.random() < 0.7 else again,
-        [Path(one) for one in changed],
+        # the list of our files is ours: a changed one that can still be read is written anew
+        [Path(one) for one in changed if Path(one).name != ".sonar_graph.json"],
     )
 
 

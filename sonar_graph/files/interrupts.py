@@ -11,6 +11,8 @@ from types import FrameType
 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended."""
+AGAIN_S = 1e-3
+"""After this time an interrupt is sent again that no Python code may see now."""
 _Signal = tuple[int, FrameType | None]
 
 
@@ -20,7 +22,8 @@ def _handling(
 ) -> Iterator[bool]:
     """Give each Ctrl-C of the block to ``handle``, with what would have been done; False where that is not possible.
 
-    Only the main thread has handlers, and one of another program's C code stays.
+    Only the main thread has handlers, and one of another program's C code stays. A Ctrl-C that comes while numba makes
+    Python objects of its results is sent again, and comes after them.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(
@@ -29,14 +32,39 @@ def _handling(
         yield False
         return
     usual: Callable[[int, FrameType | None], object] = before
-    signal.signal(
-        signal.SIGINT,
-        lambda number, frame: handle((number, frame), lambda: usual(number, frame)),
-    )
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if _makes_results(frame):
+            threading.Timer(AGAIN_S, _send, [threading.get_ident(), number]).start()
+        else:
+            handle((number, frame), lambda: usual(number, frame))
+
+    signal.signal(signal.SIGINT, interrupt)
     try:
         yield True
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _send(thread: int, number: int) -> None:
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        signal.pthread_kill(thread, number)  # also wakes a thread that waits
+
+
+def _makes_results(frame: FrameType | None) -> bool:
+    """True where compiled code calls the two Python functions by which numba makes objects of its results.
+
+    It expects no exception from them: one at this moment is a segmentation fault.
+    """
+    while frame is not None:
+        code = frame.f_code
+        makes_named_tuple = code.co_varnames[:1] == ("_cls",)
+        if makes_named_tuple or code.co_name == "_numba_unpickle":
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager

@@ -4,6 +4,8 @@ import contextlib
 import errno
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -314,6 +316,51 @@ def test_an_interrupt_swallowed_by_compiled_code_is_noticed(
             os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             check()
+
+
+INTERRUPTED_BOXING = """
+import ctypes, signal, time
+from typing import NamedTuple
+import numba, numpy as np
+from sonar_graph.files import noticed_interrupts, terminations_as_interrupts
+
+class Pair(NamedTuple):
+    first: int
+    second: int
+
+send = ctypes.CDLL(None)["raise"]
+send.argtypes, send.restype = [ctypes.c_int], ctypes.c_int
+
+@numba.njit
+def interrupted(number):
+    send(number)
+    return 1, Pair(2, 3), np.zeros(3)
+
+for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM):
+    try:
+        with terminations_as_interrupts(), noticed_interrupts():
+            print(interrupted(number)[1])
+            time.sleep(10.0)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+def test_an_interrupt_while_results_are_made_comes_after_them():
+    script = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_BOXING],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (
+        script.stdout.split("\n")[:-1]
+        == [
+            "Pair(first=2, second=3)",
+            "interrupted",
+        ]
+        * 3
+    ), script
 
 
 @pytest.mark.parametrize(
