@@ -67,10 +67,12 @@ from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import Estimate1D, Estimates3D
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sequence import Sequence
+from sonar_graph.states import Trajectory
 
 HEADING_SENSE = "heading: turn over that of the gyros"
 VERTICAL_BIAS = "gyro bias about the vertical"
 HEADING_TURN = "heading: turn towards the positions"
+OR_DVL = "; or the Doppler log"
 LARGEST_GAIN_SIGMA = 0.12
 """Of a gain that is shown: 1 and -1 are sixteen sigmas apart."""
 LARGEST_LAG_SIGMA_S = 0.5
@@ -126,13 +128,15 @@ class Check:
     """The comparison; None where the log has no such sensor."""
     sigma: Callable[[Sequence], float]
     """Of one row, in the sensor's unit."""
-    sense: Callable[[LogConfig], Advice]
+    sense: Callable[[Sequence, LogConfig], Advice]
     """Where the gain is negative or the signal is mirrored."""
     scaled: Callable[[LogConfig, float], Advice]
     """Where the gain is near 1."""
     units: Mapping[str, float] = field(default_factory=dict)
     """Factors to the right unit, by the name of the wrong one."""
     scale_key: str = "scale"
+    grave_scale: float = GRAVE_SCALE
+    """Error of a scale from which on results are doubtful, however little moves."""
     systematic: float = 0.0
     """Sigma of the gain by what the comparison leaves out."""
     slow_sigma: Callable[[Sequence], float] = lambda _: 0.0
@@ -295,12 +299,7 @@ DEPTH = Check(
     causes=(PITCH, DRIFT),
     step_unit="m",
     units=LENGTHS | PRESSURES,
-    sense=lambda config: Advice(
-        "it rises where the vehicle sinks by the Doppler log: depths downwards, an altimeter, or the Doppler log has the "
-        "wrong sense along z?",
-        f"{scale_line('depth', 'scale', config, -1.0)}; an altimeter is no depth: `use = false` under [depth]; "
-        f"`rotation` under [dvl] turns its axes",
-    ),
+    sense=lambda sequence, config: depth_sense(sequence, config),
     scaled=lambda config, gain: Advice(
         "",
         f"{scale_line('depth', 'scale', config, gain)}; of a pressure the water's density (water_density_kg_m3)",
@@ -314,7 +313,7 @@ HEADING = Check(
     sigma=lambda sequence: sequence.calibration.heading.sigma_rad,
     slow_sigma=lambda sequence: 0.1 * sequence.calibration.heading.bias_sigma_rad,
     units=DEGREES,
-    sense=lambda config: Advice(
+    sense=lambda _, config: Advice(
         "it turns against the gyros, clockwise", other_world(config, "heading")
     ),
     # a heading that turns too far is right as a rule: the gyros' rate is too small
@@ -323,6 +322,8 @@ HEADING = Check(
         scale_line("imu", "angular_velocity_scale", config, 1.0 / gain),
     ),
     least_scale=0.01,
+    # gyros keep within one per cent, and each turn adds to the error
+    grave_scale=0.03,
     quantity=HEADING_SENSE,
     causes=(DEVIATION, SOFT_IRON),
     step_unit="°",
@@ -336,7 +337,7 @@ POSITIONS = Check(
     sigma=lambda sequence: level_sigma_m(fix_sigma_m(sequence)),
     slow_sigma=lambda sequence: 0.1 * level_sigma_m(fix_sigma_m(sequence)),
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
-    sense=lambda config: Advice(
+    sense=lambda _, config: Advice(
         "north and east are exchanged",
         f"{other_world(config, 'positions')}, or the fields of position in another order; of latitude and longitude, one "
         "without its sign",
@@ -367,7 +368,7 @@ RANGE = SIGHTINGS(
     # landmarks are wrong by the error of the whole range, not of its changes
     reach=lambda sequence, _: typical_sighting(sequence)[0],
     causes=(OF_RANGES, SONAR_TURN),
-    sense=lambda _: Advice(
+    sense=lambda *_: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards, or the Doppler log has the wrong sense?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}, its yaw changed by 3.1416",
     ),
@@ -384,7 +385,7 @@ AZIMUTH = SIGHTINGS(
     units=DEGREES,
     scale_key="azimuth_scale",
     reach=lambda sequence, _: typical_sighting(sequence)[1],
-    sense=lambda config: Advice(
+    sense=lambda _, config: Advice(
         "they turn with the vehicle, mirrored",
         f'{scale_line("detections", "azimuth_scale", config, -1.0)}; of a Detection3DArray `rotation = "frd"`',
     ),
@@ -396,6 +397,30 @@ AZIMUTH = SIGHTINGS(
     is_angle=True,
 )
 CHECKS = (DEPTH, RANGE, AZIMUTH, HEADING, POSITIONS)
+
+
+def depth_sense(sequence: Sequence, config: LogConfig) -> Advice:
+    """Line for depths that run against the Doppler log; above the water they are downwards, else either may be wrong."""
+    assert sequence.depth is not None
+    cause = "it rises where the vehicle sinks by the Doppler log"
+    negated = scale_line("depth", "scale", config, -1.0)
+    if float(np.median(sequence.depth.z_m)) > HIGHEST_M:
+        return Advice(f"{cause}, above the water: depths downwards", negated)
+    return Advice(
+        f"{cause}: depths downwards, an altimeter, or the Doppler log has the wrong sense along z?",
+        f"{negated}; an altimeter is no depth: {unused('depth')}; `rotation` under [dvl] {IN_LOG_CONFIG} turns its axes",
+    )
+
+
+def begins_below_water(sequence: Sequence) -> bool:
+    """True for depths that begin at a stated start, which is not where z has no sign: they are right."""
+    start = sequence.calibration.start
+    is_deep = abs(start.position_m[2]) > HIGHEST_M
+    return (
+        start.states("position_m")
+        and is_deep
+        and not any(start_depth_findings(sequence))
+    )
 
 
 def typical_sighting(sequence: Sequence) -> tuple[float, float]:
@@ -532,7 +557,7 @@ class SensorComparison:
         is_opposite = found.gain.is_known and found.gain.value < 0
         if not (is_opposite or found.is_mirrored) or found.misfit >= MOST_MISFIT:
             return None
-        sense = self.check.sense(self.config)
+        sense = self.check.sense(self.sequence, self.config)
         return self.contradiction(sense.cause, sense.line)
 
     def of_cause(self) -> Finding | None:
@@ -606,7 +631,7 @@ class SensorComparison:
                 consequence=f"up to {error:.2g}",
                 line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
                 gravity=Gravity.GRAVE
-                if abs(off.value) > GRAVE_SCALE
+                if abs(off.value) > self.check.grave_scale
                 else self.gravity(error),
             )
         # wheels start to slip in turns: no delay of a sensor
@@ -901,24 +926,7 @@ def heading_turn(
     known = right.positions or right.truth
     if known is None or right.heading is None:
         return
-    places = known.position_m if isinstance(known, PositionFixes) else known.positions
-    heading_s = motion.since_origin(right.heading.stamps_ns)
-    yaw_rad = np.interp(motion.seconds, heading_s, np.unwrap(right.heading.yaw_rad))
-    # the way of the Doppler log, laid along the heading instead of the gyros' yaw
-    steps = np.diff(motion.path_m) * np.exp(1j * (yaw_rad - motion.yaw_rad))[1:]
-    path = np.append(0.0, np.cumsum(steps))
-    t = motion.since_origin(known.stamps_ns)
-    level = places @ [1.0, 1j, 0.0]
-    rows = motion.stretches(t, level, motion.reference(path))
-    turn = match(rows, find_lag=False)
-    angle = unknown("too little motion beside positions")
-    # north and east exchanged are a fault of the positions; a way that fits badly has no direction
-    if (
-        not turn.is_mirrored
-        and turn.misfit < MOST_MISFIT
-        and 0.5 < turn.gain.value < 2.0
-    ):
-        angle = turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, angle.reason)
+    angle = course_angle(known, right.heading.yaw_rad, right, motion)
     allowed = right.calibration.heading.bias_sigma_rad
     row = Finding(
         HEADING_TURN,
@@ -929,6 +937,12 @@ def heading_turn(
     if not matters(angle, 0.0, allowed):
         yield row
         return
+    # on a way without turns the sense shows only here
+    clockwise_rad = np.pi / 2 - right.heading.yaw_rad
+    other = course_angle(known, clockwise_rad, right, motion)
+    is_clockwise = other.is_known and not matters(other, 0.0, allowed)
+    sense = "clockwise from north, or " if is_clockwise else ""
+    of_sense = f"{other_world(config, 'heading')}; or " if is_clockwise else ""
     offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
     rpy = numbers(
         turned_mounting(right.calibration.dvl.mounting, (0.0, 0.0, angle.value)), 4
@@ -940,11 +954,35 @@ def heading_turn(
     large_rad = min(LARGE_TURN_RAD, GRAVE_ERROR * sigma)
     yield replace(
         row,
-        cause=f"{first}either its world, north or mounting is another",
-        line=f"`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}; or the Doppler log is turned on the "
+        cause=f"{first}{sense}either its world, north or mounting is another",
+        line=f"{of_sense}`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}{OR_DVL} is turned on the "
         f"vehicle: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}",
         gravity=Gravity.GRAVE if abs(angle.value) > large_rad else Gravity.ACT,
     )
+
+
+def course_angle(
+    known: PositionFixes | Trajectory,
+    yaw_rad: Floats,
+    right: Sequence,
+    motion: BodyMotion,
+) -> Estimate1D:
+    """Angle from the way of the Doppler log, laid along headings, shape (n,), to that of known positions, rad."""
+    assert right.heading is not None
+    places = known.position_m if isinstance(known, PositionFixes) else known.positions
+    heading_s = motion.since_origin(right.heading.stamps_ns)
+    yaw_rad = np.interp(motion.seconds, heading_s, np.unwrap(yaw_rad))
+    steps = np.diff(motion.path_m) * np.exp(1j * (yaw_rad - motion.yaw_rad))[1:]
+    path = np.append(0.0, np.cumsum(steps))
+    t = motion.since_origin(known.stamps_ns)
+    level = places @ [1.0, 1j, 0.0]
+    turn = match(motion.stretches(t, level, motion.reference(path)), find_lag=False)
+    reason = "too little motion beside positions"
+    # north and east exchanged are a fault of the positions; a way that fits badly has no direction
+    is_way = not turn.is_mirrored and turn.misfit < MOST_MISFIT
+    if is_way and 0.5 < turn.gain.value < 2.0:
+        return turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, reason)
+    return unknown(reason)
 
 
 HIGH_PERCENTILE = 95.0

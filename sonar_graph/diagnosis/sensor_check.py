@@ -6,7 +6,7 @@ calibration and the log configuration of a run, and becomes a line for one of th
 docs/theory/sensor_check.md.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,11 +20,15 @@ from sonar_graph.diagnosis.aiding_check import (
     CHECKS,
     DEPTH,
     HEADING,
+    HEADING_TURN,
     MOST_MISFIT,
+    OR_DVL,
     OTHER_UNIT,
     POSITIONS,
     RANGE,
     VERTICAL_BIAS,
+    Check,
+    begins_below_water,
     findings_of,
     fix_height_findings,
     fix_match,
@@ -42,6 +46,7 @@ from sonar_graph.diagnosis.axes import (
 )
 from sonar_graph.diagnosis.causes import PITCH, pitched_one, velocity_steps
 from sonar_graph.diagnosis.findings import (
+    ACTING_SIGMAS,
     ALSO,
     IN_CALIBRATION,
     IN_LOG_CONFIG,
@@ -153,6 +158,7 @@ LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
+BACKWARDS = -np.eye(3)
 
 
 def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[Finding]:
@@ -263,7 +269,10 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     D_heading = up * right.duration_s  # (3,)
     bias = bias_findings(estimates, sources, right.calibration.imu, D_heading)
     right, estimates = without_acting_bias(right, estimates)
-    by_motion = motion_findings(right, config, estimates)
+    by_motion = [
+        of_heading_alone(f, right, match.turn[2]) if f.quantity == HEADING_TURN else f
+        for f in motion_findings(right, config, estimates)
+    ]
     of_vertical = [f for f in by_motion if f.quantity == VERTICAL_BIAS]
     # one row on the bias that is known is enough
     if any(f.estimate.is_known for f in of_vertical):
@@ -508,7 +517,8 @@ def axes_findings(
         sequence = pair.corrected()
     elif (found.dvl != np.eye(3)).any():
         axes = found.dvl if found.is_vertical_sure else upright(found.dvl, sequence)
-        findings.append(dvl_axes_finding(replace(found, dvl=axes), sequence))
+        cause = axes_cause(replace(found, dvl=axes))
+        findings.append(dvl_axes_finding(axes, cause, sequence))
         sequence = turned_dvl(sequence, axes)
     return findings, sequence
 
@@ -588,14 +598,12 @@ def is_surely_negative(found: Match) -> bool:
     return gain.is_known and gain.value + CERTAIN_SIGMAS * gain.sigma < 0
 
 
-def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
+def dvl_axes_finding(axes: Floats, cause: str, sequence: Sequence) -> Finding:
     """Axes of the Doppler log, as a mounting where they are turned, as a driver's where they are mirrored.
 
     Gravity shows that the IMU is upright: a turn about another axis than the vertical is that of the Doppler log.
     """
-    axes = found.dvl
     body_R_dvl = sequence.calibration.dvl.mounting.pose().rotation().matrix()
-    cause = axes_cause(found)
     if np.linalg.det(axes) > 0:
         rpy = gtsam.Rot3(axes @ body_R_dvl).rpy()
         cause += (
@@ -605,7 +613,7 @@ def dvl_axes_finding(found: AxesMatch, sequence: Sequence) -> Finding:
     else:
         driver = np.round(body_R_dvl.T @ axes @ body_R_dvl)
         names = ", ".join(f'"{name}"' for name in signed_axes(driver))
-        cause += ": mirrored, the driver gives one axis the wrong sign"
+        cause += ": mirrored, the driver gives an axis the wrong sign"
         line = f"`rotation = [{names}]` under [dvl] {IN_LOG_CONFIG}, after which the mounting counts"
     return contradiction(DVL_AXES, cause, line, WRONG_AXES)
 
@@ -644,16 +652,20 @@ def motion_findings(
     if motion is None:
         return []
     matches = {check: check.compare(right, motion) for check in CHECKS}
-    against_gyros = [
-        check.name
-        for check in (HEADING, POSITIONS, AZIMUTH)
-        if (match := matches[check]) is not None
-        and (match.is_mirrored or is_surely_negative(match))
-    ]
+    against_gyros = names_of_opposite(matches, (HEADING, POSITIONS, AZIMUTH))
+    against_dvl = names_of_opposite(matches, (DEPTH, RANGE))
     found = list[Finding]()
-    # one of them may be mirrored; of two, the gyros are
+    # one of them may be mirrored; of two, the gyros or the Doppler log are
     rightly_turned = right
-    if len(against_gyros) > 1:
+    if len(against_dvl) > 1 or (
+        against_dvl == [DEPTH.name] and begins_below_water(right)
+    ):
+        axes = BACKWARDS if len(against_dvl) > 1 else Z_NEGATED
+        names = ", ".join(signed_axes(axes))
+        cause = f"changes of {' and '.join(against_dvl)} are as velocities about the axes ({names}) would have them"
+        found.append(dvl_axes_finding(axes, cause, right))
+        rightly_turned = turned_dvl(right, axes)
+    elif len(against_gyros) > 1:
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
         rightly_turned = scaled_gyros(right, Z_NEGATED)
@@ -707,6 +719,38 @@ def motion_findings(
     if not any(f.grave for f in found):
         found += start_place_findings(right, motion)
     return found
+
+
+def of_heading_alone(found: Finding, right: Sequence, dvl_yaw: Estimate1D) -> Finding:
+    """The turn of the heading, without the line for the Doppler log where other sensors show that it is not turned.
+
+    ``dvl_yaw``: by the accelerometers, rad.
+    """
+    if not found.acts:
+        return found
+    turn_rad = np.radians(found.estimate.value)
+    sigma_rad = np.hypot(dvl_yaw.sigma, np.radians(found.estimate.sigma))
+    fits = "the accelerometers"
+    if not dvl_yaw.is_known or abs(turn_rad) < ACTING_SIGMAS * sigma_rad:
+        pair = TurnedPair(right, np.array([0.0, 0.0, turn_rad]))
+        fits = brought_apart(right, pair.as_if("dvl"))
+    if not fits:
+        return found
+    of_heading, _, _ = found.line.partition(OR_DVL)
+    cause = f"{found.cause.replace('either its', 'its')}; the Doppler log as it is fits {fits} better"
+    return replace(found, cause=cause, line=of_heading)
+
+
+def names_of_opposite(
+    matches: Mapping[Check, Match | None], checks: Iterable[Check]
+) -> list[str]:
+    """Names of sensors that are mirrored, or run against their reference."""
+    found = ((check.name, matches[check]) for check in checks)
+    return [
+        name
+        for name, match in found
+        if match is not None and (match.is_mirrored or is_surely_negative(match))
+    ]
 
 
 class HeadingScale(NamedTuple):

@@ -566,17 +566,22 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
     """
     sequence = comparison.sequence
     lines = list[str]()
+    of_depth = (
+        "depth contradicts the start or the Doppler log; `sonar-graph inspect` compares them, `use = false` under [depth] "
+        "in the log configuration leaves them out"
+    )
+    of_sightings = "ranges, azimuths, identities or the sonar's mounting; `use = false` under [detections] leaves them out"
     if "log.doubtful" in sequence.notes:
         lines.append(f"{DOUBTFUL}: {sequence.notes['log.doubtful']}")
+        # a sensor that is wrong makes right ones contradict the estimate
+        of_depth = of_sightings = "mend what is named above first"
     for run in comparison.runs:
         refused = sum(
             row.count for row in gathered(run.refused) if row.sensor == "depth"
         )
         if sequence.depth is not None and refused > len(sequence.depth) / 2:
             lines.append(
-                f"{DOUBTFUL}: {run.estimator} refused {refused} of {len(sequence.depth)} depths: depth contradicts the "
-                "start or the Doppler log; `sonar-graph inspect` compares them, `use = false` under [depth] in the log "
-                "configuration leaves them out"
+                f"{DOUBTFUL}: {run.estimator} refused {refused} of {len(sequence.depth)} depths: {of_depth}"
             )
         if (log := run.detections) is not None:
             used = np.array(
@@ -587,8 +592,7 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
             if len(ratios) and float(np.median(ratios)) > BEYOND_DOUBT:
                 lines.append(
                     f"{DOUBTFUL}: {run.estimator}: sightings of landmarks contradict the motion beyond doubt, "
-                    f"typically {np.median(ratios):.0f} times what their noise allows: ranges, azimuths, identities or "
-                    "the sonar's mounting; `use = false` under [detections] leaves them out"
+                    f"typically {np.median(ratios):.0f} times what their noise allows: {of_sightings}"
                 )
     lines += [
         f"{DOUBTFUL}: {names}: {message}"

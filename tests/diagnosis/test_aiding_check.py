@@ -333,7 +333,15 @@ def test_depths_and_fixes_of_different_height_are_a_fault(
 
 
 @pytest.mark.parametrize(
-    ("factor", "line"), [(1.05, 1 / 1.05), (0.9, 1 / 0.9), (1.005, None), (3.0, None)]
+    ("factor", "line"),
+    [
+        (1.05, 1 / 1.05),
+        (0.9, 1 / 0.9),
+        (1.25, 0.8),
+        (0.6, 1 / 0.6),
+        (1.005, None),
+        (3.0, None),
+    ],
 )
 def test_the_scale_of_the_accelerometers_is_that_of_gravity(factor, line):
     """Within half a per cent gravity itself may differ; three times as much is another unit."""

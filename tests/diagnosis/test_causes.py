@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, PositionCalibration
+from sonar_graph.calibration import Calibration, PositionCalibration, Start
 from sonar_graph.diagnosis import check_sensors
 from sonar_graph.diagnosis.causes import velocity_steps
 from sonar_graph.measurements import (
@@ -232,6 +232,83 @@ def straight(scale: float) -> Sequence:
             id_probability=np.ones((n, 1)),
         ),
     )
+
+
+COURSE_RAD = 1.2
+SLOW_DIVE = 0.8 * np.sin(0.12 * T)
+
+
+def diving(
+    signs: tuple[float, float, float], depth_sign: float = 1.0, start_z_m: float = -20.0
+) -> Sequence:
+    """The straight way with a slow dive, which accelerations do not show; depths, headings and fixes on its course."""
+    run = straight(1.0)
+    velocity = run.dvl.velocity + 0.005 * NOISE[: len(run.dvl)]
+    t = (run.dvl.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    velocity[:, 2] += 0.8 * 0.12 * np.cos(0.12 * t)
+    height_m = -20.0 + SLOW_DIVE
+    along = 0.9 * T * np.exp(1j * COURSE_RAD)
+    places = np.column_stack([along.real, along.imag, height_m]) + 0.2 * NOISE
+    ns = run.imu.stamps_ns[::10]
+    unknown = np.full(len(ns), np.nan)
+    start = Start(position_m=(0.0, 0.0, start_z_m), rpy_rad=(0.0, 0.0, COURSE_RAD))
+    return replace(
+        run,
+        calibration=Calibration(start=start if start_z_m else Start()),
+        dvl=replace(run.dvl, velocity=velocity * signs),
+        depth=Depth(ns, (depth_sign * height_m + 0.01 * NOISE[:, 0])[::10], unknown),
+        heading=Heading(ns, COURSE_RAD + 0.01 * NOISE[::10, 1], unknown),
+        positions=PositionFixes(
+            ns[::5], places[::50], np.full((len(ns[::5]), 3, 3), np.nan)
+        ),
+    )
+
+
+WRONG_SENSES = {
+    "nothing": (lambda: diving((1, 1, 1)), ()),
+    "all of the Doppler log": (
+        lambda: diving((-1, -1, -1)),
+        ('`rotation = ["-x", "-y", "-z"]` under [dvl]',),
+    ),
+    "its z, depths begin at the start": (
+        lambda: diving((1, 1, -1)),
+        ('`rotation = ["x", "y", "-z"]` under [dvl]',),
+    ),
+    "its z, no start is stated": (
+        lambda: diving((1, 1, -1), start_z_m=0.0),
+        ("under [dvl]", "`scale = -1` under [depth]"),
+    ),
+    "depths above the water": (
+        lambda: diving((1, 1, 1), -1.0, start_z_m=0.0),
+        ("`scale = -1` under [depth]",),
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_SENSES)
+def test_of_two_that_run_against_each_other_the_right_one_is_not_asked(wrong: str):
+    make, lines = WRONG_SENSES[wrong]
+    grave = [f for f in check_sensors(make()) if f.grave]
+    asked = {role for f in grave for role in re.findall(r"under \[(\w+)\]", f.line)}
+    assert asked == {re.findall(r"\w+", line)[-1] for line in lines}
+    assert not [f for f in grave if ".mounting." in f.line]
+    assert all(any(line in f.line for f in grave) for line in lines)
+
+
+@pytest.mark.parametrize("has_sightings", [True, False])
+def test_a_clockwise_heading_on_a_straight_way_blames_no_doppler_log_that_fits(
+    has_sightings: bool,
+):
+    run = diving((1, 1, 1))
+    heading = replace(run.heading, yaw_rad=np.pi / 2 - run.heading.yaw_rad)
+    run = replace(run, heading=heading, calibration=Calibration())
+    if not has_sightings:
+        run = replace(run, detections=None)
+    (found,) = (f for f in check_sensors(run) if f.quantity.endswith("the positions"))
+    assert found.grave
+    assert '`world = "ned"` under [heading]' in found.line
+    assert "`yaw_offset_rad = " in found.line
+    assert ("dvl.mounting" in found.line) == (not has_sightings)
 
 
 def test_ranges_on_a_straight_way_blame_the_scale_and_no_current():

@@ -13,7 +13,7 @@ from rich.console import Console
 from sonar_graph.calibration import KnownMap
 from sonar_graph.evaluation import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
-from sonar_graph.measurements import Heading
+from sonar_graph.measurements import Depth, Heading
 from sonar_graph.report import sentences, summary
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.landmark_table import landmark_table
@@ -23,6 +23,7 @@ from sonar_graph.states import (
     LandmarkMap,
     Outcome,
     Refusal,
+    RefusedRow,
 )
 from sonar_graph.table import ABSENT
 from tests.synthetic import (
@@ -411,6 +412,20 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     assert (
         "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
     )
+
+
+@pytest.mark.parametrize("is_named", [True, False])
+def test_beside_a_sensor_that_is_named_no_right_one_is_to_be_left_out(is_named: bool):
+    stamps_ns = basin_comparison(60).sequence.start_ns + NS * np.arange(1, 11)
+    depth = Depth(stamps_ns, np.zeros(10), np.full(10, np.nan))
+    rows = [RefusedRow("depth", int(t), Refusal.OUT_OF_REACH, 99.0) for t in stamps_ns]
+    refused = refusing(rows, "isam2")
+    notes = {"log.doubtful": "DVL axes: wrong axes"} if is_named else {}
+    sequence = replace(refused.sequence, depth=depth, notes=notes)
+    lines = sentences.doubtful_lines(replace(refused, sequence=sequence))
+    assert len(lines) == 1 + is_named
+    assert ("use = false" in lines[-1]) == (not is_named)
+    assert ("mend what is named above first" in lines[-1]) == is_named
 
 
 @pytest.mark.usefixtures("unrendered")
