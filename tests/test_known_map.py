@@ -30,7 +30,9 @@ from sonar_graph.navigation.map_start import (
     map_data,
     moved_landmarks,
     refined,
+    sightings_covariance,
     spread,
+    turn,
 )
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.given_map import given_map_table, located_line
@@ -343,7 +345,7 @@ def test_a_place_is_as_uncertain_as_range_azimuth_pose_and_heights_make_it(
     floor_m = 0.08
     R_z = np.diag([0.03**2, 0.01**2])
     body = BodyInFrame(o_T_body, np.diag(sigmas**2), height_m**2)
-    S = spread(body, o_T_body.compose(body_T_sonar), ray, R_z, floor_m**2)
+    S, _ = spread(body, o_T_body.compose(body_T_sonar), ray, R_z, floor_m**2)
     drawn = []
     for _ in range(4000):
         pose = o_T_body.compose(gtsam.Pose3.Expmap(sigmas * rng.standard_normal(6)))
@@ -466,6 +468,113 @@ def test_the_heading_of_two_landmarks_near_each_other_refutes_no_third():
     # a landmark that gave the start has its own error in it
     _, agreeing = agreement(turned, P, np.ones(3, bool), data)
     assert agreeing.tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("has_depth", [True, False])
+def test_sightings_err_together_as_their_joint_covariance_says(has_depth: bool):
+    """By the true poses: squares over it average to 1, over that of each alone they do not."""
+    joint, apart = [], []
+    for seed in range(12):
+        world = simulate_mission(
+            MissionOptions(duration_s=90.0, landmarks=12, seed=seed)
+        )
+        noise = np.random.default_rng(seed).standard_normal((len(world.dvl), 3))
+        rough = np.tile(0.2**2 * np.eye(3), (len(noise), 1, 1))
+        velocity = world.dvl.velocity + 0.2 * noise
+        dvl = replace(world.dvl, velocity=velocity, velocity_cov=rough)
+        world = replace(world, dvl=dvl)
+        known = surveyed(world)
+        exact = KnownMap.of(known.ids, world.true_landmarks.positions, sigma_m=1e-6)
+        world = with_map(world, exact, replace_start(world))
+        if not has_depth:
+            world = replace(world, depth=None)
+        locator = MapLocator(world.calibration)
+        for window in world.replay(world.instants(1.0)):
+            for _ in locator.frames_seen(window):
+                pass
+        sightings = locator.sightings[:: max(1, len(locator.sightings) // 20)]
+        pose = world.true_poses.at(np.array([world.start_ns]))
+        yaw = pose.rotations().as_euler("ZYX")[0, 0]
+        q = np.array(exact.positions_m)[[s.row for s in sightings]]
+        level = (q - pose.positions[0])[:, :2] @ turn(yaw)
+        e = (level - [s.q for s in sightings]).ravel()
+        Q = sightings_covariance(sightings)
+        alone = [s.q for s in sightings] - level
+        joint.append(e @ np.linalg.solve(Q, e) / e.size)
+        S = np.array([s.S for s in sightings])
+        squared = np.einsum("ki,kij,kj->k", alone, np.linalg.inv(S), alone)
+        apart.append(squared.mean() / 2.0)
+    assert 0.6 < np.mean(joint) < 1.4, joint
+    # each alone has the error of odometry as often as it was seen
+    assert np.std(apart) > 1.5 * np.std(joint)
+
+
+def replace_start(world: Sequence) -> Start:
+    """The true height and tilt."""
+    pose = world.true_poses.at(np.array([world.start_ns]))
+    yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
+    return world.calibration.start.model_copy(
+        update={
+            "position_m": tuple(pose.positions[0].tolist()),
+            "rpy_rad": (roll, pitch, yaw),
+            "source": "map",
+        }
+    )
+
+
+STEP_M = 0.6
+
+
+def groups_in_a_row(known: KnownMap, rng: np.random.Generator) -> list[MapSighting]:
+    """Each landmark as seen once, from group to group; odometry errs between groups by `STEP_M`, and within by nothing."""
+    by_place = np.hstack([np.zeros((2, 3)), np.eye(2, 3)])
+    C = np.zeros((6, 6))
+    drift_m = np.zeros(2)
+    sightings = []
+    for row, place in enumerate(known.positions_m):
+        if row % 3 == 0:
+            C = C + np.diag([0, 0, 0, STEP_M**2, STEP_M**2, 0])
+            drift_m = drift_m + STEP_M * rng.standard_normal(2)
+        q = np.array(place[:2]) + drift_m + 0.02 * rng.standard_normal(2)
+        S = C[3:5, 3:5] + 0.02**2 * np.eye(2)
+        sightings.append(MapSighting(row, q, S, True, by_place, C))
+    return sightings
+
+
+def test_a_mirror_image_fits_groups_in_a_row_only_as_if_they_erred_apart():
+    """Each group has a shape that no drift of odometry mirrors."""
+    rng = np.random.default_rng(4)
+    in_row = np.array([[10.0 * k, 0.1 * k] for k in range(4)])
+    groups = [place + rng.uniform(-0.4, 0.4, (3, 2)) for place in in_row]
+    places = np.concatenate(groups)
+    known = KnownMap.of(
+        range(12), np.column_stack([places, -4 * np.ones(12)]), sigma_m=0.01
+    )
+    mirrored = KnownMap.of(
+        known.ids, np.array(known.positions_m) * [1, -1, 1], sigma_m=0.01
+    )
+    sightings = groups_in_a_row(known, rng)
+    apart = [s._replace(C_odometry=np.zeros((6, 6))) for s in sightings]
+    assert located(sightings, known) is not None
+    assert located(sightings, mirrored) is None
+    # the negative control: without what they share it would be claimed
+    assert located(apart, mirrored) is not None
+
+
+@pytest.mark.parametrize("common_m", [0.02, 0.5])
+def test_a_landmark_that_moved_less_than_the_map_errs_as_a_whole_is_left_out(common_m):
+    """By the others: what all places of a map share moves the start, and hides no single one."""
+    rng = np.random.default_rng(5)
+    places = np.column_stack([rng.uniform(0, 30, (6, 2)), np.full(6, -4.0)])
+    together = np.kron(np.ones((6, 6)), common_m**2 * np.eye(3))
+    known = KnownMap.of(range(6), places, covariance_m2=together + 0.03**2 * np.eye(18))
+    S = 0.03**2 * np.eye(2)
+    seen = [MapSighting(k, places[k, :2] + [0.8 * (k == 2), 0.0], S) for k in range(6)]
+    found = located([s for s in seen for _ in range(3)], known)
+    assert found is not None
+    assert found.agreeing == {0, 1, 3, 4, 5}
+    data = map_data([s for s in seen for _ in range(3)], known)
+    assert moved_landmarks(found, data) == [2]
 
 
 def test_one_wrong_line_of_a_survey_is_named_and_the_start_is_found(dive):

@@ -554,15 +554,17 @@ class SensorComparison:
     def opposite(self) -> Finding | None:
         """Another sense, of a sensor that agrees with its reference otherwise."""
         found = self.found
-        is_opposite = found.gain.is_known and found.gain.value < 0
+        gain = found.gain
+        is_opposite = gain.is_known and gain.value + ACTING_SIGMAS * gain.sigma < 0
         if not (is_opposite or found.is_mirrored) or found.misfit >= MOST_MISFIT:
             return None
         sense = self.check.sense(self.sequence, self.config)
         return self.contradiction(sense.cause, sense.line)
 
     def of_cause(self) -> Finding | None:
-        """A cause of the check's own; a gain that is a unit has another one only where that fits better."""
-        most = 1 / AS_GOOD if self.units else AS_GOOD
+        """A cause of the check's own; only where it fits better than a gain that is a unit, or the gyros' scale."""
+        has_gain = self.units or self.check.is_angle
+        most = 1 / AS_GOOD if has_gain else AS_GOOD
         known = self.sequence.calibration
         return cause_of(self.check.name, self.check.causes, self.found, known, most)
 

@@ -175,6 +175,11 @@ def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
         # in a turn the force is w v: a wrong scale of the gyro about the vertical looks alike but for changes of speed
         with_gyro = rows.quadratic_form(np.diag([1.0, 1.0, scale]))
         is_of_dvl = of_scale < square_of(with_gyro, np.eye(3))
+        if scale < 0 and is_of_dvl:
+            # level motion hardly shows the sense along z: then a turn
+            senses = (np.diag([-1.0, -1.0, 1.0]), -np.eye(3))
+            P = min(senses, key=lambda P: square_of(Q, -scale * P))
+            return AxesMatch(np.eye(3), P, ratio)
         is_other = not 1 / OTHER_UNIT < scale < OTHER_UNIT
         is_unit = scale > 0 and is_other and is_of_dvl
         return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)

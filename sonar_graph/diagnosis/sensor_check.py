@@ -653,17 +653,12 @@ def motion_findings(
         return []
     matches = {check: check.compare(right, motion) for check in CHECKS}
     against_gyros = names_of_opposite(matches, (HEADING, POSITIONS, AZIMUTH))
-    against_dvl = names_of_opposite(matches, (DEPTH, RANGE))
     found = list[Finding]()
     # one of them may be mirrored; of two, the gyros or the Doppler log are
     rightly_turned = right
-    if len(against_dvl) > 1 or (
-        against_dvl == [DEPTH.name] and begins_below_water(right)
-    ):
-        axes = BACKWARDS if len(against_dvl) > 1 else Z_NEGATED
-        names = ", ".join(signed_axes(axes))
-        cause = f"changes of {' and '.join(against_dvl)} are as velocities about the axes ({names}) would have them"
-        found.append(dvl_axes_finding(axes, cause, right))
+    if backwards := reversed_dvl(right, matches):
+        of_dvl, axes = backwards
+        found.append(of_dvl)
         rightly_turned = turned_dvl(right, axes)
     elif len(against_gyros) > 1:
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
@@ -719,6 +714,22 @@ def motion_findings(
     if not any(f.grave for f in found):
         found += start_place_findings(right, motion)
     return found
+
+
+def reversed_dvl(
+    right: Sequence, matches: Mapping[Check, Match | None]
+) -> tuple[Finding, Floats] | None:
+    """A Doppler log against which depth and ranges run, or depths that are right, and its axes; None where it is right."""
+    against = names_of_opposite(matches, (DEPTH, RANGE))
+    if len(against) > 1:
+        axes = BACKWARDS
+    elif against == [DEPTH.name] and begins_below_water(right):
+        axes = Z_NEGATED
+    else:
+        return None
+    names = ", ".join(signed_axes(axes))
+    cause = f"changes of {' and '.join(against)} are as velocities about the axes ({names}) would have them"
+    return dvl_axes_finding(axes, cause, right), axes
 
 
 def of_heading_alone(found: Finding, right: Sequence, dvl_yaw: Estimate1D) -> Finding:

@@ -531,10 +531,12 @@ class _Replay:
         peak_memory_mb = memory.rise_mb()
         detections = estimator.detections()
         self._stage = "at the end, outcome checked"
+        reasons = "; ".join(withheld_of(estimator))
         if not self._estimates:
-            reasons = "; ".join(withheld_of(estimator))
             raise EvaluationError(reasons or "process never returned an estimate")
         returned(smoothed, Trajectory, "trajectory()")
+        if not len(smoothed) and reasons:
+            raise EvaluationError(f"it took all its poses back: {reasons}")
         returned(landmarks, LandmarkMap, "landmarks()")
         returned(detections, DetectionLog, "detections()")
         causal = Trajectory.from_estimates(self._estimates)

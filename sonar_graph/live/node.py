@@ -43,6 +43,8 @@ from sonar_graph.live.worker import Answer, LiveOutcome, Worker
 from sonar_graph.logs import ROLES, LiveRecord, wanted_types
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import short_name
+from sonar_graph.models import MOVED
+from sonar_graph.navigation import LOCATED_AGAIN
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Estimate
@@ -120,6 +122,8 @@ class LiveRun:
         self._done_s: dict[str, float] = {}
         """When each thing that is done now and then was done last."""
         self._withheld: list[str] = []
+        self._is_located = False
+        self._told_of_map: set[str] = set()
         self._estimates = 0
         self._next_frame_ns = 0
         self._latency_ns = 0
@@ -335,6 +339,8 @@ class LiveRun:
     def _use(self, answer: Answer) -> None:
         assert self._predictor is not None
         self._withheld = answer.withheld
+        self._now.withheld = tuple(answer.withheld)
+        self._tell_of_map(answer)
         self._longest_update_s = max(self._longest_update_s, answer.update_s)
         self._estimates += len(answer.estimates)
         self._now.estimates += len(answer.estimates)
@@ -352,6 +358,20 @@ class LiveRun:
             landmarks, markers = payloads_of_map(answer.landmarks, newest.stamp_ns)
             self._put("/sonar_graph/landmarks", landmarks)
             self._put("/sonar_graph/markers", markers)
+
+    def _tell_of_map(self, answer: Answer) -> None:
+        """Say once where the vehicle was located in its map, and what moved in it."""
+        assert self.engine.calibration is not None
+        news = [m for m in answer.withheld if m.startswith((LOCATED_AGAIN, MOVED))]
+        is_found = self.engine.calibration.start.source == "map"
+        if is_found and answer.estimates and not self._is_located:
+            self._is_located = True
+            x, y, _ = answer.estimates[0].world_T_body.translation()
+            news.append(f"located in the map at ({x:.2f}, {y:.2f}) m")
+        for message in news:
+            if message not in self._told_of_map:
+                self._told_of_map.add(message)
+                self._said(message)
 
     def _state(self, period_s: float) -> None:
         """Publish the state of the seconds since the last one, and give its line to the user."""

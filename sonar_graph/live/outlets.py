@@ -191,6 +191,8 @@ class Status:
     --------
     >>> Status().line(dropped=0, latency_ms=2.0, period_s=1.0)
     'no pose yet: it needs rows of IMU and Doppler log'
+    >>> Status(withheld=("not yet located",)).line(dropped=0, latency_ms=2.0, period_s=1.0)
+    'no pose yet: not yet located'
     """
 
     start_ns: int = 0
@@ -204,6 +206,8 @@ class Status:
     landmarks: int = 0
     detected_ns: int = 0
     """Stamp of the newest frame with a detection; 0: none has come."""
+    withheld: tuple[str, ...] = ()
+    """What the estimator could not use, in its own words."""
     last: str = ""
     """The line before."""
 
@@ -225,8 +229,9 @@ class Status:
         return line
 
     def _line(self, dropped: int, latency_ms: float, period_s: float) -> str:
+        told = "; ".join(self.withheld)
         if self.at is None:
-            return "no pose yet: it needs rows of IMU and Doppler log"
+            return f"no pose yet: {told or 'it needs rows of IMU and Doppler log'}"
         T = self.at.world_T_body
         C = body_to_ros(self.at.covariance[None], T[None, :3, :3])[0]
         # of the position, along the world's axes

@@ -6,9 +6,9 @@ For use in any GTSAM program: docs/tutorials/05_preintegration.py.
 # fmt: off
 from sonar_graph.motion import Motions, MotionSource, PreintegratedMotion
 from sonar_graph.navigation.map_check import MapFit, map_fit
-from sonar_graph.navigation.map_start import make_estimator
+from sonar_graph.navigation.map_start import LOCATED_AGAIN, make_estimator
 from sonar_graph.navigation.odometry import Odometry
 
 __all__ = [
-    "MapFit", "MotionSource", "Motions", "Odometry", "PreintegratedMotion", "make_estimator", "map_fit",
+    "LOCATED_AGAIN", "MapFit", "MotionSource", "Motions", "Odometry", "PreintegratedMotion", "make_estimator", "map_fit",
 ]

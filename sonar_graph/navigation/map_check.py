@@ -1,7 +1,8 @@
 """Check of a known map against the sightings of a log: other identities, axes, units and sigmas, another start.
 
-Where no more than half of the landmarks agree with the best start (`map_start`), the map is tried with each mistake of
-`MISTAKES` undone. One with which more landmarks agree, and most of them, is named. A wrong sign of the heights may leave the
+Where not all landmarks agree with the best start (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
+with which more landmarks agree, and most of them, is named, where that evidence (2) is `CLEAR` times as large, or only half
+of the landmarks agree without it. A wrong sign of the heights may leave the
 start where it is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, for
 which one landmark is enough, or where the evidence (2) of the best start is `CLEAR` times as large with it. Two exchanged
 identities are named by the evidence of the map with that exchange undone: a priori each of the n (n - 1) / 2 exchanges is
@@ -20,6 +21,7 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.navigation.map_start import (
     MOST_OF_LANDMARK,
     ODDS,
+    WATCHED_S,
     FoundStart,
     MapLocator,
     MapSighting,
@@ -28,16 +30,15 @@ from sonar_graph.navigation.map_start import (
     map_data,
     moved_landmarks,
     newest_of_each,
+    refined,
 )
 from sonar_graph.sequence import Sequence
 
 CLEAR = 10.0 * ODDS
 """Ratio of evidences from which on a mistake is named: a map with one is a tenth as probable a priori."""
-LONGEST_S = 300.0
-"""Time after the start within which sightings count: later the odometry has drifted. It counts all the same as long as
-fewer than `ENOUGH` landmarks, or not all of a small map, were seen."""
 ENOUGH = 4
-"""Number of landmarks that show an exchange of two identities."""
+"""Number of landmarks that show an exchange of two identities. As long as fewer, or not all of a small map, were seen,
+sightings count also after `WATCHED_S`, when the odometry has drifted."""
 NEWEST_OF_EACH = 2
 """Number of sightings of each landmark in which an exchange is looked for."""
 FEWEST_SIGHTINGS = 5
@@ -104,21 +105,34 @@ def map_fit(sequence: Sequence) -> MapFit:
         if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
+    elsewhere: tuple[int, ...] = ()
+    if start is not None:
+        data = map_data(newest_of_each(given.sightings, MOST_OF_LANDMARK), known)
+        # odometry has drifted since the first start
+        start = refined(start.parameters, data) or start
+        moved = moved_landmarks(start, data)
+        elsewhere = tuple(sorted(known.ids[row] for row in moved))
+        if len(moved) >= len(start.agreeing):
+            start = None
     # of a map with other axes a few landmarks fit somewhere, and some of the others in pairs
-    before = agreeing(given)
-    is_doubted = 2 * before <= len(seen_rows(given))
-    for mistake, T in MISTAKES.items() if is_doubted else ():
+    before = 0 if elsewhere and start is None else agreeing(given)
+    seen = len(seen_rows(given))
+    is_doubted = 2 * before <= seen
+    for mistake, T in MISTAKES.items() if before < seen else ():
         corrected = followed(sequence, undone(known, T))
-        is_better = fits(corrected.newest(), corrected.map)
-        if is_better and agreeing(corrected) > before:
+        gain = evidence(corrected) - evidence(given)
+        # in another unit the map has another area, and wrong identities another density
+        is_same_area = bool(np.isclose(abs(np.linalg.det(T)), 1.0))
+        is_clear = is_same_area and math.isfinite(gain) and gain > math.log(CLEAR)
+        is_better = is_clear or (is_doubted and fits(corrected.newest(), corrected.map))
+        after = agreeing(corrected)
+        if is_better and after > before and 2 * after > seen:
             return MapFit(None, mistake, remedy_of(known, T))
     swaps = exchanged_identities(given.sightings, known)
     if swaps:
         return MapFit(None, *of_swaps(swaps))
     if start is not None:
-        data = map_data(newest_of_each(given.sightings, MOST_OF_LANDMARK), known)
-        moved = moved_landmarks(start, data)
-        return MapFit(start, elsewhere=tuple(sorted(known.ids[row] for row in moved)))
+        return MapFit(start, elsewhere=elsewhere)
     looser = known.model_copy(
         update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
     )
@@ -150,7 +164,7 @@ def locators(sequence: Sequence, known: KnownMap) -> Iterator[MapLocator]:
     locator = MapLocator(sequence.calibration.model_copy(update={"map": known}))
     enough = min(ENOUGH, len(known.ids))
     for window in windows(sequence):
-        is_late = window.end_ns - sequence.start_ns > LONGEST_S * 1e9
+        is_late = window.end_ns - sequence.start_ns > WATCHED_S * 1e9
         if is_late and len(seen_rows(locator)) >= enough:
             return
         if any([*locator.frames_seen(window)]):
@@ -218,10 +232,16 @@ def evidence(locator: MapLocator) -> float:
 
 
 def agreeing(locator: MapLocator) -> int:
-    """Number of landmarks that agree with the best start."""
+    """Number of landmarks that agree with the best start, by the newest sightings of each."""
     newest = locator.newest()
     starts = candidates(map_data(newest, locator.map)) if newest else []
-    return len(starts[0].agreeing) if starts else 0
+    data = (
+        map_data(newest_of_each(locator.sightings, MOST_OF_LANDMARK), locator.map)
+        if newest
+        else None
+    )
+    best = refined(starts[0].parameters, data) if starts and data else None
+    return 0 if best is None else len(best.agreeing)
 
 
 def shown(locator: MapLocator) -> float:

@@ -1,15 +1,17 @@
 """Start at an unknown place of a known map: where the vehicle is, from the landmarks that it identifies.
 
 The level frame o has its origin at the body's first position, and its yaw is zero there. Odometry carries it on, so that
-a sighting of landmark i gives a place ``q_k`` in o, with covariance ``S_k``; the landmark's height in the map gives the
-elevation. Heading psi and position t of the start are common to all sightings::
+a sighting of landmark i gives a place ``q_k`` in o; the landmark's height in the map gives the elevation. Errors of
+odometry add up, so that two sightings share that of the earlier one: their covariance is ``Q_kl``. Heading psi and position
+t of the start are common to all sightings::
 
-    m_i = R(psi) q_k + t + e_k,    cov(e_k, e_l) = M_ij + R(psi) S_k R(psi)^T where k = l                      (1)
+    m_i = R(psi) q_k + t + e_k,    cov(e_k, e_l) = M_ij + R(psi) Q_kl R(psi)^T                                (1)
 
 Two sightings of different landmarks give psi and t (two-point resection). Every pair proposes a start, refined by least
 squares over the landmarks that agree with it. A landmark agrees where most of its sightings lie within the 99.9 % ellipse
-of (1). One with a wrong identity lies anywhere in the area A of the map. The evidence of a start h, with the prior of a
-pose uniform over A and all headings, and its posterior covariance Sigma::
+of (1), and its mean within that of where the others predict it. One with a wrong identity lies anywhere in the area A of
+the map. The evidence of a start h, with the prior of a pose uniform over A and all headings, and its posterior covariance
+Sigma::
 
     E(h) = N(e) prod_agreeing a_i prod_others (b_i / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)                (2)
     E(one) = sum_i a_i / A prod_{j not i} (b_j / A),    E(other) = prod_i (c_i / A)                          (3)
@@ -93,6 +95,7 @@ LEAST_RISE = 0.05
 """Rise of the sonar's fan with elevation, beside which it counts as level."""
 WATCHED_S = 120.0
 """Time after the vehicle was located in which a better start replaces a wrong one."""
+LOCATED_AGAIN = "located again in the map"
 SAME = 10.0
 """Distance, in sigmas, of starts that are refined to the same one."""
 STEPS = 5
@@ -111,6 +114,12 @@ class MapSighting(NamedTuple):
     """Its covariance, shape (2, 2), m²."""
     is_in_view: bool = True
     """False where the height of the landmark in the map puts it outside of the sonar's vertical aperture."""
+    by_odometry: Floats = np.zeros((2, 6))
+    """Change of q with an error of odometry, which is the same twist in o for all that is seen later, shape (2, 6)."""
+    C_odometry: Floats = np.zeros((6, 6))
+    """Covariance of that error until this frame, without that by the bias of the gyros, shape (6, 6); S has both."""
+    by_bias: Floats = np.zeros((2, 3))
+    """Change of q with the bias over its sigma, which is the same at all frames, shape (2, 3)."""
 
 
 class FoundStart(NamedTuple):
@@ -134,6 +143,8 @@ class BodyInFrame(NamedTuple):
     """Covariance of its perturbation, in its own axes, shape (6, 6)."""
     height_m2: float = 0.0
     """Variance of its height beside C."""
+    by_odometry: Floats = np.zeros((6, 6))
+    """Change of the perturbation with an error of odometry, a twist in o, shape (6, 6)."""
 
 
 class DepthRow(NamedTuple):
@@ -193,9 +204,12 @@ class MapLocator:
                 continue
             if self.found is not None and not outweighs(best, self.found, data):
                 continue
-            moved = moved_landmarks(best, data)
             # a few fit a mirror image, or a map of another place, by chance; each new start repeats the run until now
-            if len(moved) * (1 + self._given_up) >= len(best.agreeing):
+            by_all = refined(best.parameters, data)
+            moved = [] if by_all is None else moved_landmarks(by_all, data)
+            if by_all is None or len(moved) * (1 + self._given_up) >= len(
+                by_all.agreeing
+            ):
                 self._refuted = best
                 continue
             self.found = best
@@ -301,7 +315,11 @@ class MapLocator:
         )
         by_bias = motion.D_bias * self._calibration.imu.gyro_bias_sigma  # (6, 3)
         C = motion.covariance + by_bias @ by_bias.T
-        body = self._at_depth(BodyInFrame(o_T_start.compose(motion.i_T_j), C), stamp_ns)
+        o_T_body = o_T_start.compose(motion.i_T_j)
+        o_Ad_body = o_T_body.AdjointMap()
+        C_odometry = o_Ad_body @ motion.covariance @ o_Ad_body.T
+        by_odometry = o_T_body.inverse().AdjointMap()
+        body = self._at_depth(BodyInFrame(o_T_body, C, 0.0, by_odometry), stamp_ns)
         o_T_sonar = body.o_T_body.compose(self._body_T_sonar)
         half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
         for k in rows:
@@ -319,10 +337,16 @@ class MapLocator:
             R_z = frame.range_azimuth_cov[k]
             R_z = self._R_z if np.isnan(R_z).any() else R_z
             of_floor_m2 = self._heights_m2[row] if elevation_rad is not None else 0.0
-            S = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
+            S, by_body = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
             # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
             is_in_view = elevation_rad is not None and abs(elevation_rad) <= half_rad
-            self.sightings.append(MapSighting(row, point[:2], S, is_in_view))
+            by_error = by_body @ body.by_odometry
+            of_bias = by_error @ o_Ad_body @ by_bias
+            self.sightings.append(
+                MapSighting(
+                    row, point[:2], S, is_in_view, by_error, C_odometry, of_bias
+                )
+            )
             self._times_seen[row] += 1
         return True
 
@@ -345,7 +369,8 @@ class MapLocator:
         # without the error of odometry along the vertical
         level = np.eye(6)
         level[3:, 3:] -= np.outer(R[2], R[2])
-        return BodyInFrame(o_T_body, level @ body.C @ level.T, depth_m2)
+        by_odometry = level @ body.by_odometry
+        return BodyInFrame(o_T_body, level @ body.C @ level.T, depth_m2, by_odometry)
 
     def newest(self) -> list[MapSighting]:
         """The newest sightings, a few of each landmark, in the order of time."""
@@ -406,8 +431,8 @@ class Ray(NamedTuple):
 
 def spread(
     body: BodyInFrame, o_T_sonar: gtsam.Pose3, sight: Ray, R_z: Floats, floor_m2: float
-) -> Floats:
-    """Covariance of the level place of a landmark, shape (2, 2), m².
+) -> tuple[Floats, Floats]:
+    """Covariance of the level place of a landmark, shape (2, 2), m², and its change with the body's perturbation, (2, 6).
 
     ``R_z``: of range and azimuth; ``floor_m2``: variance of its height in the map. Where the body errs in height by h, or
     turns the landmark up by h, the elevation changes until the height is that of the map again.
@@ -421,7 +446,7 @@ def spread(
     R = body.o_T_body.rotation().matrix()
     by_turn = -R @ cross_matrix(body.o_T_body.transformTo(point))
     by_body = np.hstack([by_turn, R])  # (3, 6)
-    cov = by_z @ R_z @ by_z.T + by_body @ body.C @ by_body.T  # (3, 3)
+    cov = by_z @ R_z @ by_z.T  # (3, 3)
     cov[2, 2] += MOST_OF_LANDMARK * (body.height_m2 + floor_m2)
     sin_e = math.sin(sight.elevation_rad)
     in_fan = [math.cos(sight.azimuth_rad), math.sin(sight.azimuth_rad)]
@@ -433,7 +458,9 @@ def spread(
     rise = math.copysign(max(abs(up_fan[2]), LEAST_RISE), up_fan[2])
     by_height = up_fan[:2] / rise  # of the level place
     T = np.column_stack([np.eye(2), -by_height])  # (2, 3)
-    return np.asarray(T @ cov @ T.T)
+    level_by_body = T @ by_body
+    S = T @ cov @ T.T + level_by_body @ body.C @ level_by_body.T
+    return np.asarray(S), np.asarray(level_by_body)
 
 
 def cross_matrix(v: Floats) -> Floats:
@@ -473,7 +500,27 @@ def map_data(sightings: list[MapSighting], known: KnownMap) -> "MapData":
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
     is_of = np.unique(rows)[:, None] == rows
     weights = IdentityWeights.of(is_of.sum(axis=1))
-    return MapData(q, S, np.linalg.inv(S), rows, is_of, places, M, area_m2, weights)
+    Q = sightings_covariance(sightings)
+    S_inv = np.linalg.inv(S)
+    return MapData(q, S, S_inv, Q, rows, is_of, places, M, area_m2, weights)
+
+
+def sightings_covariance(sightings: list[MapSighting]) -> Floats:
+    """Joint covariance of places in the order of time, shape (2 k, 2 k).
+
+    Errors of odometry are twists in o, which add up: the later of two sightings has that of the earlier one, too. Without
+    what they share, landmarks of a group would count as independent.
+    """
+    H = np.array([s.by_odometry for s in sightings])  # (k, 2, 6)
+    C = np.array([s.C_odometry for s in sightings])  # (k, 6, 6)
+    B = np.array([s.by_bias for s in sightings])  # (k, 2, 3)
+    k = len(sightings)
+    earlier_later = np.einsum("kia,lja->kilj", H @ C, H)  # (k, 2, k, 2)
+    is_earlier = np.arange(k)[:, None] < np.arange(k)
+    shared = earlier_later * is_earlier[:, None, :, None]
+    Q = shared + shared.transpose(2, 3, 0, 1) + np.einsum("kia,lja->kilj", B, B)
+    Q[np.arange(k), :, np.arange(k)] = [s.S for s in sightings]
+    return np.asarray(Q.reshape(2 * k, 2 * k))
 
 
 def candidates(data: "MapData") -> list[FoundStart]:
@@ -527,6 +574,8 @@ class MapData(NamedTuple):
     """Shape (k, 2, 2)."""
     S_inv: Floats
     """Inverses of S."""
+    Q: Floats
+    """Joint covariance of q, shape (2 k, 2 k)."""
     rows: Any
     """Landmark of each sighting, shape (k,)."""
     is_of: Any
@@ -556,7 +605,9 @@ def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
             continue
         seen = data.q[j] - data.q[k]
         placed = data.places[b] - data.places[a]
-        cov = data.S[k] + data.S[j] + data.place_cov[a] + data.place_cov[b]
+        shared = data.Q[2 * k : 2 * k + 2, 2 * j : 2 * j + 2]
+        of_seen = data.S[k] + data.S[j] - shared - shared.T
+        cov = of_seen + data.place_cov[a] + data.place_cov[b]
         far_m = float(np.linalg.norm(placed))
         sigma_m = math.sqrt(float(np.trace(cov)))
         if abs(float(np.linalg.norm(seen)) - far_m) > 4.0 * sigma_m or far_m < sigma_m:
@@ -575,38 +626,94 @@ def turn(psi: float) -> Floats:
     return np.array([[c, -s], [s, c]])
 
 
-def refined(parameters: Floats, data: MapData) -> FoundStart | None:
-    """Least squares of (1) over the landmarks that agree, with the evidence (2)."""
+def refined(
+    parameters: Floats, data: MapData, kept: frozenset[int] = frozenset()
+) -> FoundStart | None:
+    """Least squares of (1) over the landmarks that agree, with the evidence (2).
+
+    A landmark that the others predict elsewhere, with what their sightings share, is left out, the worst one first. Those
+    ``kept`` agree in any case.
+    """
     seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
-    agreeing = np.ones(len(seen), bool)
+    is_kept = np.isin(seen, list(kept))
+    left_out = np.zeros(len(seen), bool)
+    while True:
+        fit = least_squares(parameters, data, is_kept, left_out)
+        if fit is None:
+            return None
+        fitted = np.flatnonzero(fit.agreeing)
+        squared = np.where(is_kept[fitted], 0.0, fit.squared)
+        worst = int(squared.argmax())
+        if len(fitted) <= 2 or squared[worst] <= AGREES:
+            break
+        left_out[fitted[worst]] = True
+        parameters = fit.parameters
+    wrong = float(np.sum(data.weights.wrong[~fit.agreeing] - math.log(data.area_m2)))
+    right = fit.log_density + float(np.sum(data.weights.right[fit.agreeing]))
+    log_det = math.log(np.linalg.det(fit.covariance))
+    volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * log_det
+    prior = math.log(2.0 * math.pi * data.area_m2)
+    rows = frozenset(seen[fit.agreeing].tolist())
+    log_evidence = right + wrong + volume - prior
+    return FoundStart(fit.parameters, fit.covariance, log_evidence, rows)
+
+
+class Fit(NamedTuple):
+    """Least squares of (1) over a landmarks that agree, of l that were seen."""
+
+    parameters: Floats
+    """Shape (3,)."""
+    covariance: Floats
+    """Shape (3, 3)."""
+    agreeing: Any
+    """Shape (l,)."""
+    squared: Floats
+    """Squared Mahalanobis distance of each from where the others have it, shape (a,)."""
+    log_density: float
+    """Of all errors."""
+
+
+def least_squares(
+    parameters: Floats, data: MapData, kept: Any, left_out: Any
+) -> Fit | None:
+    """Fit to the landmarks that are kept or agree, but for some, shapes (l,); None where they are fewer than two."""
+    seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
+    agreeing = ~left_out
     covariance = np.zeros((3, 3))
     for _ in range(STEPS):
         agrees, agreeing = agreement(parameters, covariance, agreeing, data)
+        agrees[kept] = data.is_of[kept]
+        agreeing = (agreeing | kept) & ~left_out
         if np.count_nonzero(agreeing) < 2:
             return None
-        q, S = mean_sightings(agrees[agreeing], data)  # (a, 2), (a, 2, 2)
+        q, Q = mean_sightings(agrees[agreeing], data)  # (a, 2), (2 a, 2 a)
+        a = len(q)
         R = turn(parameters[0])
         e = (data.places[seen[agreeing]] - q @ R.T - parameters[1:]).ravel()  # (2 a,)
-        W = joint_covariance(R @ S @ R.T, seen[agreeing], data.M)  # (2 a, 2 a)
+        all_R = np.kron(np.eye(a), R)
+        coordinates = np.add.outer(2 * seen[agreeing], np.arange(2)).ravel()
+        W = all_R @ Q @ all_R.T + data.M[np.ix_(coordinates, coordinates)]  # (2 a, 2 a)
+        W_inv = np.linalg.inv(W)
         by_psi = q @ turn(parameters[0] + 0.5 * math.pi).T
-        by_t = np.tile(np.eye(2), (len(q), 1))
+        by_t = np.tile(np.eye(2), (a, 1))
         J = np.column_stack([by_psi.ravel(), by_t])  # (2 a, 3)
-        weighted = np.linalg.solve(W, J)  # (2 a, 3)
-        information = J.T @ weighted
+        weighted = W_inv @ J  # (2 a, 3)
         gradient = weighted.T @ e
-        step = np.linalg.solve(information, gradient)
+        covariance = np.asarray(np.linalg.inv(J.T @ weighted), np.float64)
+        step = covariance @ gradient
         parameters = parameters + step
-        covariance = np.asarray(np.linalg.inv(information), np.float64)
         if float(step @ gradient) < CONVERGED:
             break
     _, log_det = np.linalg.slogdet(2.0 * math.pi * W)
-    log_density = -0.5 * float(e @ np.linalg.solve(W, e) + log_det)
-    wrong = float(np.sum(data.weights.wrong[~agreeing] - math.log(data.area_m2)))
-    right = log_density + float(np.sum(data.weights.right[agreeing]))
-    volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * math.log(np.linalg.det(covariance))
-    prior = math.log(2.0 * math.pi * data.area_m2)
-    rows = frozenset(seen[agreeing].tolist())
-    return FoundStart(parameters, covariance, right + wrong + volume - prior, rows)
+    log_density = -0.5 * float(e @ W_inv @ e + log_det)
+    # what is left of W^-1 beside the start predicts each landmark by the others
+    P = W_inv - weighted @ covariance @ weighted.T
+    own = P.reshape(a, 2, a, 2)[np.arange(a), :, np.arange(a)]  # (a, 2, 2)
+    residual = (P @ e).reshape(a, 2, 1)
+    squared = np.zeros(a)
+    if a > 2:
+        squared = (residual * np.linalg.solve(own, residual)).sum(axis=(1, 2))
+    return Fit(parameters, covariance, agreeing, squared, log_density)
 
 
 def agreement(
@@ -630,23 +737,24 @@ def agreement(
 
 
 def outweighs(best: FoundStart, other: FoundStart, data: MapData) -> bool:
-    """Check that a start explains all sightings `ODDS` times better than another; drift of odometry moves both."""
+    """Check that a start explains all sightings `ODDS` times better than one by the other's landmarks.
+
+    Drift of odometry moves both.
+    """
     new = refined(best.parameters, data)
-    old = refined(other.parameters, data)
+    old = refined(other.parameters, data, other.agreeing)
     if new is None or old is None:
         return new is not None
     return new.log_evidence - old.log_evidence >= math.log(ODDS)
 
 
 def moved_landmarks(start: FoundStart, data: MapData) -> list[int]:
-    """Rows of the landmarks that disagree with a start, and stand elsewhere."""
-    seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
-    fitted = np.isin(seen, list(start.agreeing))
-    _, agreeing = agreement(start.parameters, start.covariance, fitted, data)
+    """Rows of the landmarks that disagree with a start by the same sightings, and stand elsewhere."""
     return [
-        int(data.rows[is_of][0])
-        for is_of in data.is_of[~agreeing]
-        if stands_elsewhere(is_of, data)
+        int(row)
+        for is_of in data.is_of
+        if (row := data.rows[is_of][0]) not in start.agreeing
+        and stands_elsewhere(is_of, data)
     ]
 
 
@@ -658,21 +766,16 @@ def stands_elsewhere(is_of: Any, data: MapData) -> bool:
     return bool(np.count_nonzero(squared <= AGREES) >= FEWEST)
 
 
-def joint_covariance(S: Floats, rows: Any, M: Floats) -> Floats:
-    """Covariance of (1) over some landmarks, whose places err together, shape (2 a, 2 a); ``S``: (a, 2, 2)."""
-    coordinates = np.add.outer(2 * rows, np.arange(2)).ravel()
-    W = M[np.ix_(coordinates, coordinates)]
-    for k, cov in enumerate(S):
-        W[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
-    return W
-
-
 def mean_sightings(is_averaged: Any, data: MapData) -> tuple[Floats, Floats]:
-    """Weighted mean of some sightings of each landmark, shape (a, 2), and its covariance; ``is_averaged``: (a, k)."""
+    """Weighted mean of some sightings of each landmark, shape (a, 2), and the joint covariance of the means, (2 a, 2 a).
+
+    ``is_averaged``: (a, k).
+    """
     information = np.einsum("ak,kij->aij", is_averaged, data.S_inv)
-    weighted = np.einsum("ak,kij,kj->ai", is_averaged, data.S_inv, data.q)
     S = np.linalg.inv(information)
-    return np.einsum("aij,aj->ai", S, weighted), S
+    weights = np.einsum("ak,aij,kjl->aikl", is_averaged, S, data.S_inv)  # (a, 2, k, 2)
+    A = weights.reshape(2 * len(S), -1)
+    return (A @ data.q.ravel()).reshape(-1, 2), np.asarray(A @ data.Q @ A.T)
 
 
 def is_linear(start: FoundStart, data: MapData) -> bool:
@@ -785,7 +888,7 @@ class StartInMap:
         if self._inner is None:
             return [f"not yet located in the map: {self._locator.lacking()}"]
         again = [
-            f"located again in the map after {after_s:.1f} s: landmarks that were seen by then contradict the place before; "
+            f"{LOCATED_AGAIN} after {after_s:.1f} s: landmarks that were seen by then contradict the place before; "
             "causal poses until then are wrong"
             for after_s in self._locator.again_s()
         ]

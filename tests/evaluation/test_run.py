@@ -191,6 +191,13 @@ IMPOSSIBLE = "causal covariance is impossible"
             "has 39 instants, not the 40",
         ),
         (
+            {
+                "trajectory": lambda self: Offset.trajectory(self).rows(slice(0)),
+                "withheld": lambda _: ["not located"],
+            },
+            "it took all its poses back: not located",
+        ),
+        (
             {"landmarks": lambda _: map_of([[np.inf, 0.0, 0.0]])},
             "is not finite in 1 of 1 rows, first at landmark 7",
         ),
