@@ -2,19 +2,14 @@
 
 A start is wrong where a `live` run came too late; a map is in another unit or has other axes (`sonar_graph.navigation`).
 
-With the pose of the body at the start (x_0, yaw_0) and the level motion since then (path d, yaw psi, in axes of the body
-at the start), a landmark seen at range r and azimuth a is, as complex numbers of the level plane, at::
-
-    x_0 + exp(i yaw_0) (d + exp(i psi) (l + r cos(e) exp(i a)))        l: place of the sonar on the body
-
-with the elevation e from the heights. Its median distance from the true place over the first sightings is compared with the
-sigmas of the start.
+Landmarks whose places are known, of a map or of the truth, place the start with a covariance (`map_start`).
 """
 
 from collections.abc import Iterator
 
 import numpy as np
 
+from sonar_graph.calibration import KnownMap
 from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     IN_CALIBRATION,
@@ -28,7 +23,7 @@ from sonar_graph.diagnosis.findings import (
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.models import listed, wrap_angle
-from sonar_graph.navigation import map_fit
+from sonar_graph.navigation import FoundStart, first_start, map_fit
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import FIRST_ANONYMOUS_ID
@@ -39,11 +34,8 @@ FARTHEST_RAD = 0.1
 """The same for its heading, with landmarks that are some metres away."""
 STAMPS_S = 1.0
 """Error of the truth's stamps that is no error of the start."""
-SEEN_WITHIN_S = 60.0
-"""Time after the start in which sightings of true landmarks count: later the gyros may have turned the path."""
-FEWEST_SIGHTINGS = 5
-SUREST = 0.9
-"""Least probability of the identity of a sighting that counts."""
+TRUE_SIGMA_M = 0.01
+"""Of a place that counts as true."""
 
 
 def start_place_findings(right: Sequence, motion: BodyMotion) -> Iterator[Finding]:
@@ -54,9 +46,13 @@ def start_place_findings(right: Sequence, motion: BodyMotion) -> Iterator[Findin
     if by_truth is not None:
         yield by_truth
         return
-    by_map = map_finding(right, motion)
-    if by_map is not None:
-        yield by_map
+    true = right.true_landmarks
+    if true is None or right.detections is None or not len(true):
+        return
+    known = KnownMap.of(true.ids.tolist(), true.positions, sigma_m=TRUE_SIGMA_M)
+    found = first_start(right, known)
+    if found is not None:
+        yield from stated_start_findings(right, found, "of the truth")
 
 
 def map_findings(right: Sequence) -> Iterator[Finding]:
@@ -113,24 +109,31 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
             line="correct these lines of the map, or leave them out",
             gravity=Gravity.ACT,
         )
+    if fit.start is not None and right.calibration.start.source != "map":
+        yield from stated_start_findings(right, fit.start, "of the map")
+
+
+def stated_start_findings(
+    right: Sequence, found: FoundStart, whose: str
+) -> Iterator[Finding]:
+    """A stated start that is elsewhere than landmarks have it; nothing where both agree by their covariances."""
     start = right.calibration.start
-    if fit.start is None or start.source == "map":
-        return
-    yaw, x, y = fit.start.parameters.tolist()
+    yaw, x, y = found.parameters.tolist()
     off = np.array([wrap_angle(yaw - start.rpy_rad[2]), *(x, y)])
     off[1:] -= start.position_m[:2]
     stated = [start.rpy_sigma_rad[2], *start.position_sigma_m[:2]]
-    P = fit.start.covariance + np.diag(np.square(stated))
+    P = found.covariance + np.diag(np.square(stated))
     is_near = np.hypot(*off[1:]) <= FARTHEST_M and abs(off[0]) <= FARTHEST_RAD
     if is_near or float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
         return
     stated_x, stated_y, _ = start.position_m
     yield contradiction(
         "start pose",
-        estimate="the map has it elsewhere",
-        cause=f"landmarks of the map place it at ({x:.2f}, {y:.2f}) m with a yaw of {wrap_angle(yaw):.3f} rad, not at "
-        f"({stated_x:.2f}, {stated_y:.2f}) m with {start.rpy_rad[2]:.3f} rad: another start, or a map of another frame?",
-        line=f'`start.source = "map"` {IN_CALIBRATION}',
+        estimate="the landmarks have it elsewhere",
+        cause=f"landmarks {whose} place it at ({x:.2f}, {y:.2f}) m with a yaw of {wrap_angle(yaw):.3f} rad, not at "
+        f"({stated_x:.2f}, {stated_y:.2f}) m with {start.rpy_rad[2]:.3f} rad: another start, a log that is joined after its "
+        "beginning, or landmarks of another frame?",
+        line=f'`start.source = "map"` with a map, or `start.position_m` and `start.rpy_rad`, {IN_CALIBRATION}',
     )
 
 
@@ -160,53 +163,6 @@ def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
         cause=f"the truth begins {off_m:.2f} m from the start of the calibration: a log that is joined after its beginning, "
         "or another world of the truth?",
         line=f"`start.position_m = {numbers(place, 2)}` {IN_CALIBRATION}",
-    )
-
-
-def map_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
-    """True landmarks as the first sightings place them from the start; None where they agree, or are too few."""
-    seen = right.detections
-    true = right.true_landmarks
-    if seen is None or true is None or not len(true):
-        return None
-    ids, sureness = seen.most_probable()
-    t = motion.since_origin(seen.stamps_ns)
-    begin_s = float(motion.since_origin(np.array([right.start_ns]))[0])
-    counts = seen.are_sound() & (sureness >= SUREST) & np.isin(ids, true.ids)
-    counts &= (t >= begin_s) & (t <= begin_s + SEEN_WITHIN_S)
-    # in a gap the motion is not known
-    counts &= np.isfinite(motion.reference(motion.path_m)(t))
-    if np.count_nonzero(counts) < FEWEST_SIGHTINGS:
-        return None
-    start = right.calibration.start
-    mounting = right.calibration.sonar.mounting.pose()
-    lever = mounting.translation()
-    landmarks = true.positions[np.searchsorted(true.ids, ids[counts])]  # (k, 3)
-    height_m = start.position_m[2] + motion.reference(motion.height_m)(t[counts])
-    down_m = np.nan_to_num(landmarks[:, 2] - height_m - lever[2])
-    range_m = seen.range_m[counts]
-    level_m = np.sqrt(np.maximum(range_m**2 - down_m**2, 0.0))
-    azimuth = seen.azimuth_rad[counts] + mounting.rotation().yaw()
-    on_body = lever[0] + 1j * lever[1] + level_m * np.exp(1j * azimuth)
-    yaw = motion.reference(motion.yaw_rad)(t[counts])
-    since_start = motion.reference(motion.path_m)(t[counts]) + on_body * np.exp(
-        1j * yaw
-    )
-    x, y, _ = start.position_m
-    placed = x + 1j * y + since_start * np.exp(1j * start.rpy_rad[2])
-    off = placed - (landmarks[:, 0] + 1j * landmarks[:, 1])
-    off_m = float(np.median(np.abs(off)))
-    reach_m = float(np.median(np.abs(since_start)))
-    sigma_m = float(np.hypot(sigma_of(right), reach_m * start.rpy_sigma_rad[2]))
-    if not off_m > FARTHEST_M + ACTING_SIGMAS * sigma_m:
-        return None
-    return contradiction(
-        "start pose: distance of the first landmarks from the map",
-        estimate=Estimate1D(off_m, sigma_m),
-        unit="m",
-        cause=f"seen from the start of the calibration, landmarks are {off_m:.2f} m from their true places: another start, "
-        "another world of the map, or a log that is joined after its beginning?",
-        line=f"`start.position_m` and `start.rpy_rad` {IN_CALIBRATION}",
     )
 
 
