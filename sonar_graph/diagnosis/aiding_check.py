@@ -574,7 +574,8 @@ class SensorComparison:
         found = self.found
         size = self.size
         most = SLIPPING_UNIT if self.slips else OTHER_UNIT
-        is_sure = matters(replace(found.gain, value=size - 1.0), 0.0)
+        of_one = replace(found.gain, value=size - 1.0)
+        is_sure = matters(of_one, 0.0) and matters(found.gain, 0.0)
         if not is_sure or 1 / most < size < most or found.misfit > MOST_MISFIT:
             return None
         units = self.units
