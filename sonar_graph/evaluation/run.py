@@ -113,16 +113,14 @@ def check_outcome(
 ) -> None:
     """Refuse results that cannot be scored.
 
-    Raises `EvaluationError` when the smoothed trajectory does not end with the causal one's instants; a
-    pose or landmark is not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
+    Raises `EvaluationError` when the smoothed trajectory lacks instants of the causal one; a pose or landmark is not finite;
+    a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
     """
-    # scores compare both paths instant by instant; a start that is found later gives smoothed poses before it
-    earlier = len(smoothed) - len(causal)
-    if earlier < 0 or not np.array_equal(
-        causal.stamps_ns, smoothed.stamps_ns[earlier:]
-    ):
+    # scores compare both paths instant by instant; while a start is looked for, there are smoothed poses only
+    missing = np.setdiff1d(causal.stamps_ns, smoothed.stamps_ns)
+    if len(missing):
         raise EvaluationError(
-            f"trajectory() has {len(smoothed)} instants, not the {len(causal)} for which process returned estimates"
+            f"trajectory() lacks {len(missing)} of the {len(causal)} instants for which process returned estimates"
         )
     for kind, trajectory in (("causal", causal), ("smoothed", smoothed)):
         # one look at all numbers of a pose: a NaN in the rotation spoils every score too

@@ -188,7 +188,7 @@ IMPOSSIBLE = "causal covariance is impossible"
         ({"process": lambda *_: None}, "never returned an estimate"),
         (
             {"trajectory": lambda self: Offset.trajectory(self).rows(slice(1, None))},
-            "has 39 instants, not the 40",
+            "trajectory() lacks 1 of the 40 instants",
         ),
         (
             {

@@ -126,12 +126,14 @@ def smoothed_differs(run: RunResult) -> bool:
     """True where the smoothed path is not the causal one."""
     if run.smoothed is None or not len(run.smoothed):
         return False
-    # paths of different lengths are different paths
-    if run.causal is None or len(run.causal) > len(run.smoothed):
+    if run.causal is None:
         return True
-    # a start that is found in a map gives smoothed poses before the first causal one
-    later = run.smoothed.positions[len(run.smoothed) - len(run.causal) :]
-    return bool(np.abs(later - run.causal.positions).max(initial=0.0) > SAME_M)
+    # a start that is found in a map gives smoothed poses where there is no causal one
+    _, rows, of_causal = np.intersect1d(
+        run.smoothed.stamps_ns, run.causal.stamps_ns, return_indices=True
+    )
+    apart = run.smoothed.positions[rows] - run.causal.positions[of_causal]
+    return len(rows) < len(run.causal) or bool(np.abs(apart).max(initial=0.0) > SAME_M)
 
 
 def _paths(run: RunResult) -> list[Floats]:
