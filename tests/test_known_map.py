@@ -20,6 +20,7 @@ from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_check import exchanged_identities
 from sonar_graph.navigation.map_start import (
     BodyInFrame,
+    FoundStart,
     IdentityWeights,
     MapLocator,
     MapSighting,
@@ -372,6 +373,30 @@ def test_a_height_that_nothing_tells_is_uncertain_in_a_map(dive, tmp_path):
     found = in_map(told, tmp_path / "map.toml")
     assert found.calibration.start.position_sigma_m[2] < 0.1
     assert "log.warnings" not in found.notes
+
+
+def test_a_map_without_some_landmarks_keeps_what_the_others_share():
+    root = np.random.default_rng(3).standard_normal((12, 12))
+    known = KnownMap.of(
+        [7, 3, 5, 9], np.arange(12.0).reshape(4, 3), covariance_m2=root @ root.T
+    )
+    rest = known.without([3, 9])
+    kept = [0, 1, 2, 6, 7, 8]
+    assert rest.ids == (7, 5)
+    np.testing.assert_allclose(rest.positions_m, [[0, 1, 2], [6, 7, 8]])
+    np.testing.assert_allclose(rest.joint(), known.joint()[np.ix_(kept, kept)])
+
+
+def test_the_prior_of_a_found_start_is_as_uncertain_as_it_was_found():
+    """Heading and place each by their own sigma, three times as large."""
+    locator = MapLocator(Calibration(map=random_map(np.random.default_rng(1), 3)))
+    P = np.diag([0.05, 0.3, 0.4]) ** 2
+    locator.found = FoundStart(np.array([0.7, 4.0, 5.0]), P, 0.0, frozenset({0, 1}))
+    start = locator.start()
+    assert start.rpy_rad[2] == pytest.approx(0.7)
+    assert start.position_m[:2] == pytest.approx((4.0, 5.0))
+    assert start.rpy_sigma_rad[2] == pytest.approx(0.15)
+    assert start.position_sigma_m[:2] == pytest.approx((1.2, 1.2))
 
 
 def test_a_found_start_that_most_landmarks_refute_later_is_given_up():
