@@ -574,11 +574,13 @@ class SensorComparison:
         found = self.found
         size = self.size
         most = SLIPPING_UNIT if self.slips else OTHER_UNIT
-        of_one = replace(found.gain, value=size - 1.0)
-        is_sure = matters(of_one, 0.0) and matters(found.gain, 0.0)
+        is_sure = matters(replace(found.gain, value=size - 1.0), 0.0)
         if not is_sure or 1 / most < size < most or found.misfit > MOST_MISFIT:
             return None
         units = self.units
+        # a gain that may be none is no unit
+        if not units and not matters(found.gain, 0.0):
+            return None
         if not units and size < 1 and self.is_late:
             return self.contradiction(
                 f"it follows {check.against} {found.lag.value:.2g} s late and {size:.2g} times as far: smoothed by the "
