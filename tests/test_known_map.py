@@ -1,6 +1,7 @@
 """Runs with a map of known landmarks: every estimator starts with it, and notices what moved."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -498,7 +499,8 @@ def test_the_heading_of_two_landmarks_near_each_other_refutes_no_third():
 @pytest.mark.parametrize("has_depth", [True, False])
 def test_sightings_err_together_as_their_joint_covariance_says(has_depth: bool):
     """By the true poses: squares over it average to 1, over that of each alone they do not."""
-    joint, apart = [], []
+    joint = []
+    apart = []
     for seed in range(12):
         world = simulate_mission(
             MissionOptions(duration_s=90.0, landmarks=12, seed=seed)
@@ -532,6 +534,26 @@ def test_sightings_err_together_as_their_joint_covariance_says(has_depth: bool):
     assert 0.6 < np.mean(joint) < 1.4, joint
     # each alone has the error of odometry as often as it was seen
     assert np.std(apart) > 1.5 * np.std(joint)
+
+
+def test_gaps_of_the_doppler_log_leave_a_joint_covariance_and_the_start(dive):
+    """A gap is bridged anew at its end, so that errors of odometry are smaller after it than within."""
+    t = (dive.dvl.stamps_ns - dive.start_ns) * 1e-9
+    is_measured = ~((t > 3.0) & (t < 9.0)) & ~((t > 20.0) & (t < 34.0))
+    gaps = replace(dive, dvl=dive.dvl.rows(np.flatnonzero(is_measured)))
+    gaps = with_map(gaps, surveyed(dive), replace_start(dive))
+    locator = MapLocator(gaps.calibration)
+    for window in gaps.replay(gaps.instants(2.0)):
+        locator.add(window)
+    sightings = locator.newest()
+    C = [s.C_odometry for s in locator.sightings]
+    steps = [np.linalg.eigvalsh(b - a)[0] for a, b in pairwise(C)]
+    # otherwise there is nothing to show
+    assert min(steps) < -1e-4
+    assert np.linalg.eigvalsh(sightings_covariance(sightings))[0] > 0.0
+    assert locator.found is not None
+    x, y, _ = replace_start(dive).position_m
+    np.testing.assert_allclose(locator.found.parameters[1:], [x, y], atol=0.5)
 
 
 def replace_start(world: Sequence) -> Start:

@@ -36,7 +36,7 @@ FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
 """Factor to m/s²; mg and cm/s² differ by a fiftieth, so that the nearest counts."""
 SHARE_OF_GRAVITY = 0.2
 """Relative difference allowed between a typical specific force and gravity."""
-LARGEST_FORCE_SCALE = 2.0
+MOST_OF_GRAVITY = 2.0
 """Beyond it, either way, it is another unit, or forces without gravity."""
 LEAST_FORCE_SCALE = 0.015
 """Gravity differs by 0.5 % over the Earth, and what accelerates a vehicle adds little."""
@@ -195,7 +195,7 @@ def force_scale(sequence: Sequence, config: LogConfig) -> Finding | None:
     forces = lengths(sequence.imu.specific_force)
     gravity = sequence.calibration.gravity_m_s2
     typical = float(np.median(forces)) if len(forces) else 0.0
-    if not 1 / LARGEST_FORCE_SCALE < typical / gravity < LARGEST_FORCE_SCALE:
+    if not 1 / MOST_OF_GRAVITY < typical / gravity < MOST_OF_GRAVITY:
         return None
     imu = sequence.calibration.imu
     scale = Estimate1D(typical / gravity, imu.accel_bias_sigma / gravity)

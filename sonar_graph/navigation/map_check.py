@@ -1,7 +1,7 @@
 """Check of a known map against the sightings of a log: other identities, axes, units and sigmas, another start.
 
 Where not all landmarks agree with the best start (`map_start`), the map is tried with each mistake of `MISTAKES` undone. One
-with which more landmarks agree, and most of them, is named, where that evidence (2) is `CLEAR` times as large, or only half
+with which more landmarks agree, and most of them, is named, where its evidence (2) is `CLEAR` times as large, or only half
 of the landmarks agree without it. A wrong sign of the heights may leave the
 start where it is. It is named where the sonar's vertical aperture allows far more of the sightings with the other sign, for
 which one landmark is enough, or where the evidence (2) of the best start is `CLEAR` times as large with it. Two exchanged

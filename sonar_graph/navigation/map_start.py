@@ -512,15 +512,32 @@ def sightings_covariance(sightings: list[MapSighting]) -> Floats:
     what they share, landmarks of a group would count as independent.
     """
     H = np.array([s.by_odometry for s in sightings])  # (k, 2, 6)
-    C = np.array([s.C_odometry for s in sightings])  # (k, 6, 6)
+    C = shared_errors(np.array([s.C_odometry for s in sightings]))  # (k, 6, 6)
+    S = np.array([s.S for s in sightings])  # (k, 2, 2)
     B = np.array([s.by_bias for s in sightings])  # (k, 2, 3)
     k = len(sightings)
     earlier_later = np.einsum("kia,lja->kilj", H @ C, H)  # (k, 2, k, 2)
     is_earlier = np.arange(k)[:, None] < np.arange(k)
     shared = earlier_later * is_earlier[:, None, :, None]
     Q = shared + shared.transpose(2, 3, 0, 1) + np.einsum("kia,lja->kilj", B, B)
-    Q[np.arange(k), :, np.arange(k)] = [s.S for s in sightings]
-    return np.asarray(Q.reshape(2 * k, 2 * k))
+    Q[np.arange(k), :, np.arange(k)] = S
+    Q = Q.reshape(2 * k, 2 * k)
+    lacking_m2 = max(float(-np.linalg.eigvalsh(Q)[0]), 0.0)
+    if lacking_m2:
+        lacking_m2 += float(np.linalg.eigvalsh(S).min())
+    return np.asarray(Q + lacking_m2 * np.eye(2 * k))
+
+
+def shared_errors(C: Floats) -> Floats:
+    """Covariances of odometry, shape (k, 6, 6), each reduced to what is in the later ones too.
+
+    A gap of the Doppler log is bridged anew at its end: sightings within it have errors that later ones have not.
+    """
+    C = C.copy()
+    for k in range(len(C) - 2, -1, -1):
+        w, V = np.linalg.eigh(C[k + 1] - C[k])
+        C[k] += (V * np.minimum(w, 0.0)) @ V.T
+    return C
 
 
 def candidates(data: "MapData") -> list[FoundStart]:
@@ -605,8 +622,9 @@ def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
             continue
         seen = data.q[j] - data.q[k]
         placed = data.places[b] - data.places[a]
-        shared = data.Q[2 * k : 2 * k + 2, 2 * j : 2 * j + 2]
-        of_seen = data.S[k] + data.S[j] - shared - shared.T
+        both = data.Q.reshape(len(data.q), 2, -1, 2)[[k, j]][:, :, [k, j]]
+        shared = both[0, :, 1]
+        of_seen = both[0, :, 0] + both[1, :, 1] - shared - shared.T
         cov = of_seen + data.place_cov[a] + data.place_cov[b]
         far_m = float(np.linalg.norm(placed))
         sigma_m = math.sqrt(float(np.trace(cov)))

@@ -329,7 +329,8 @@ class Pair(NamedTuple):
     second: int
 
 send = ctypes.CDLL(None)["raise"]
-send.argtypes, send.restype = [ctypes.c_int], ctypes.c_int
+send.argtypes = [ctypes.c_int]
+send.restype = ctypes.c_int
 
 @numba.njit
 def interrupted(number):
