@@ -360,6 +360,7 @@ class EkfSlam(FilterShell):
     The paper has none of the following. Each is used only where the calibration or the log calls for it:
 
     - depth, direction of gravity (`Calibration.use_gravity`), plane (`planar`), floor of known height (`floor`);
+    - a known map (`map`), whose landmarks are in the state from the start, with a gate;
     - headings and position fixes with Huber's kernel, and the constant bias of the compass in the state;
     - in a gap of the Doppler log, the gyro bias in Q, and ``k (k + 1)`` times the motion's covariance for the k-th
       measurement of a kind.

@@ -609,7 +609,6 @@ class FilterShell(ABC):
         """Give a landmark a number in the state; `UNKNOWN` takes it away."""
         views.slot[views.ids == landmark_id] = slot
         if slot == UNKNOWN:
-            views.gate[views.ids == landmark_id] = self.sonar.gate
             del self._slots[landmark_id]
         else:
             self._slots[landmark_id] = slot
@@ -625,8 +624,12 @@ class FilterShell(ABC):
                 views.outcome[row], views.e[row], views.S[row] = judged
 
     def _gate(self, landmark_id: int) -> float:
-        """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map."""
-        if landmark_id not in self._known.held:
+        """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map.
+
+        Also of a landmark that has moved: two objects may have its identity, of which only one is mapped again.
+        """
+        known = self._known
+        if landmark_id not in known.held and landmark_id not in known.moved:
             return self.sonar.gate
         return min(self.sonar.gate, self._known.gate)
 

@@ -146,6 +146,20 @@ def test_landmarks_that_moved_are_named_and_mapped_anew(dive, kind):
 
 
 @each
+def test_an_identity_that_two_objects_have_does_not_bend_the_pose(dive, kind):
+    """One of them is mapped again; the sightings of the other are refused."""
+    known = surveyed(dive)
+    detections = dive.detections
+    ids = detections.candidate_ids.copy()
+    ids[ids == known.ids[0]] = known.ids[3]
+    both = replace(dive, detections=replace(detections, candidate_ids=ids))
+    _, right = run(kind, with_map(dive, known))
+    estimator, told = run(kind, with_map(both, known))
+    assert rms_m(dive, told) < 1.3 * rms_m(dive, right) + 1e-2
+    assert f"landmark {known.ids[3]}:" in estimator.withheld()[0]
+
+
+@each
 def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
     known = surveyed(dive)
     more = KnownMap.of(
