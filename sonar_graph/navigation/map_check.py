@@ -12,20 +12,23 @@ equally probable.
 import math
 from collections.abc import Iterator
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sonar_graph.calibration import KnownMap
-from sonar_graph.measurements import Measurements
+from sonar_graph.measurements import Floats, Measurements
 from sonar_graph.navigation.map_start import (
+    AGREES,
     MOST_OF_LANDMARK,
     ODDS,
     WATCHED_S,
     FoundStart,
+    MapData,
     MapLocator,
     MapSighting,
     candidates,
+    least_squares,
     located,
     map_data,
     moved_landmarks,
@@ -105,17 +108,19 @@ def map_fit(sequence: Sequence) -> MapFit:
         if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
+    moved: list[int] = []
     elsewhere: tuple[int, ...] = ()
     if start is not None:
         data = map_data(newest_of_each(given.sightings, MOST_OF_LANDMARK), known)
         # odometry has drifted since the first start
         start = refined(start.parameters, data) or start
         moved = moved_landmarks(start, data)
-        elsewhere = tuple(sorted(known.ids[row] for row in moved))
+        surely = surely_elsewhere(start, moved, data)
+        elsewhere = tuple(sorted(known.ids[row] for row in surely))
         if len(moved) >= len(start.agreeing):
             start = None
     # of a map with other axes a few landmarks fit somewhere, and some of the others in pairs
-    before = 0 if elsewhere and start is None else agreeing(given)
+    before = 0 if moved and start is None else agreeing(given)
     seen = len(seen_rows(given))
     is_doubted = 2 * before <= seen
     for mistake, T in MISTAKES.items() if before < seen else ():
@@ -169,6 +174,31 @@ def locators(sequence: Sequence, known: KnownMap) -> Iterator[MapLocator]:
             return
         if any([*locator.frames_seen(window)]):
             yield locator
+
+
+def surely_elsewhere(start: FoundStart, moved: list[int], data: MapData) -> list[int]:
+    """Rows of the landmarks that moved, if the sightings err as much more than stated as those that agree do.
+
+    The squared distances of n landmarks from where the others have them, two degrees of freedom each, have a mean of 2.
+    On recordings of wheeled robots it is 4, and a right landmark can be 19 away.
+    """
+    seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
+    agreeing = np.isin(seen, [*start.agreeing])
+    squared = squared_distances(start, agreeing, data)
+    limit = AGREES * max(1.0, 0.5 * float(np.mean(squared)))
+    surely = []
+    for row in moved:
+        with_it = agreeing | (seen == row)
+        place = int(np.flatnonzero(seen[with_it] == row)[0])
+        if squared_distances(start, with_it, data)[place] > limit:
+            surely.append(row)
+    return surely
+
+
+def squared_distances(start: FoundStart, fitted: Any, data: MapData) -> Floats:
+    """Squared Mahalanobis distances of the landmarks that are fitted, shape (l,), from where the others have them."""
+    fit = least_squares(start.parameters, data, fitted, ~fitted)
+    return fit.squared if fit else np.zeros(np.count_nonzero(fitted))
 
 
 def seen_rows(locator: MapLocator) -> set[int]:
