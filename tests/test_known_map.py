@@ -159,6 +159,28 @@ def test_an_identity_that_two_objects_have_does_not_bend_the_pose(dive, kind):
     assert f"landmark {known.ids[3]}:" in estimator.withheld()[0]
 
 
+@pytest.mark.parametrize("shift_m", [0.0, 3.0])
+@each
+def test_what_landmarks_of_a_map_share_stays_also_if_one_moved(dive, kind, shift_m):
+    """Sightings tell only the pose in the map: the place of all is that of map and start, weighed."""
+    common_m = 0.5
+    start_m = 1.0
+    known = displaced(surveyed(dive), [1], (shift_m, 0.0))
+    n = len(known.ids)
+    joint = SIGMA_M**2 * np.eye(3 * n)
+    joint += common_m**2 * np.kron(np.ones((n, n)), np.eye(3))
+    known = KnownMap.of(known.ids, known.positions_m, covariance_m2=joint)
+    start = dive.calibration.start.model_copy(
+        update={"position_sigma_m": (start_m, start_m, 0.05)}
+    )
+    estimator, _ = run(kind, with_map(dive, known, start))
+    found = known_map_of(estimator)
+    stayed = np.array(found.ids) != 1
+    mean_x = np.kron(stayed / stayed.sum(), [1.0, 0.0, 0.0])  # (3 n,)
+    variance = mean_x @ found.joint() @ mean_x
+    assert variance == pytest.approx(1.0 / (common_m**-2 + start_m**-2), rel=0.01)
+
+
 @each
 def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
     known = surveyed(dive)
@@ -203,6 +225,11 @@ def test_wrong_identities_here_and_there_are_no_landmark_that_moved():
     slowly = [(0, (1.0 + 0.2 * k, -0.2)) for k in range(3)]
     assert judged(agree + scattered + slowly).moved == [0]
     assert judged(agree + scattered, step_s=1.0).moved == [0]
+    # the difference of two innovations has twice the covariance of one
+    alike = [(0, (range_m, 0.0)) for range_m in (1.0, 1.45, 1.0)]
+    assert judged(agree + alike).moved == [0]
+    unlike = [(0, (range_m, 0.0)) for range_m in (1.0, 1.6, 1.0)]
+    assert judged(agree + unlike).moved == []
 
 
 def in_view(dive: Sequence, places: np.ndarray) -> Sequence:
@@ -336,6 +363,18 @@ def test_a_found_start_has_the_height_of_the_depths(dive):
     )
     found = [locator_after(with_map(dive, known, each)).found for each in (start, high)]
     np.testing.assert_allclose(found[1].parameters, found[0].parameters, atol=0.05)
+    # a pressure port 2 m below the vehicle's origin measures another height of the same vehicle
+    port = dive.calibration.depth.model_copy(update={"port_m": (0.0, 0.0, -2.0)})
+    lower = replace(
+        with_map(dive, known, high),
+        depth=replace(dive.depth, z_m=dive.depth.z_m - 2.0),
+    )
+    below = replace(
+        lower, calibration=lower.calibration.model_copy(update={"depth": port})
+    )
+    np.testing.assert_allclose(
+        locator_after(below).found.parameters, found[1].parameters, atol=0.02
+    )
 
 
 def locator_after(dive: Sequence) -> MapLocator:
@@ -482,6 +521,17 @@ def test_a_third_landmark_far_from_two_others_agrees_with_their_start():
     assert found is not None
     assert found.agreeing == {0, 1, 2}
     np.testing.assert_allclose(found.parameters[0], 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize(("error", "agrees"), [((0.0, 3.0), True), ((3.0, 0.0), False)])
+def test_the_covariance_of_a_sighting_turns_with_the_heading(error, agrees):
+    """One that is sure of its y in the level frame is sure of its x in a world turned by a right angle."""
+    known = KnownMap.of([0], [(10.0, 5.0, -4.0)], sigma_m=0.05)
+    start = np.array([0.5 * np.pi, 2.0, 1.0])
+    q = turn(-start[0]) @ (np.array([10.0, 5.0]) - start[1:] - error)
+    data = map_data([MapSighting(0, q, np.diag([1.0, 0.1]) ** 2)], known)
+    _, found = agreement(start, np.zeros((3, 3)), np.array([False]), data)
+    assert found.tolist() == [agrees]
 
 
 def test_the_heading_of_two_landmarks_near_each_other_refutes_no_third():
