@@ -2,8 +2,6 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -269,47 +267,6 @@ def test_a_hash_is_taken_once_in_a_process(package, hashed):
     )
     assert source_hash("hashed_package") == before
     assert hashed() != before
-
-
-@pytest.mark.slow
-def test_key_changes_with_a_changed_checkout(write_suite, tmp_path):
-    """Another process has a copy of the package in which one comment was added, under the same version."""
-    import baselines
-    import sonar_graph
-
-    for package in (sonar_graph, baselines):
-        folder = Path(str(package.__file__)).parent
-        shutil.copytree(
-            folder,
-            tmp_path / "copy" / folder.name,
-            ignore=shutil.ignore_patterns("__pycache__"),
-        )
-    suite = write_suite(
-        HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "isam2"\n'
-    )
-    here = [run.key for run in plan_runs(read_suite(suite))]
-    assert keys_by(tmp_path / "copy", suite) == here
-    with (tmp_path / "copy" / "baselines" / "dead_reckoning.py").open("a") as file:
-        file.write("# another\n")
-    of_baselines = keys_by(tmp_path / "copy", suite)
-    assert of_baselines[0] != here[0]
-    assert of_baselines[1] == here[1]
-    with (tmp_path / "copy" / "sonar_graph" / "states.py").open("a") as file:
-        file.write("# another\n")
-    assert not {*here, *of_baselines} & set(keys_by(tmp_path / "copy", suite))
-
-
-def keys_by(code: Path, suite: Path) -> list[str]:
-    """Keys as the package in a folder plans them."""
-    program = (
-        f"import sys; sys.path.insert(0, {str(code)!r})\n"
-        "from pathlib import Path; from sonar_graph.batch import plan; from sonar_graph.batch.suite import read_suite\n"
-        f"assert plan.__file__.startswith({str(code)!r})\n"
-        f"print(*(run.key for run in plan.plan_runs(read_suite(Path({str(suite)!r})))))"
-    )
-    return subprocess.run(
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True
-    ).stdout.split()
 
 
 ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'

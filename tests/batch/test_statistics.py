@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -170,16 +169,6 @@ def test_pairs_of_one_case_make_one_difference(
     assert (told.median, told.mean) == pytest.approx((median, mean), nan_ok=True)
 
 
-def test_a_mean_difference_is_that_of_the_means_of_cases():
-    own = np.arange(12.0)
-    reference = np.array([1.0, 0.0] * 6)
-    halves = statistics.paired(own, reference, [i // 2 for i in range(12)])
-    assert halves == replace(
-        statistics.paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)),
-        each="seed",
-    )
-
-
 @pytest.mark.parametrize(
     ("scale", "verdict", "least", "most"),
     [
@@ -229,14 +218,6 @@ def finite(differences: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(differences), np.sign(differences) * 100.0, differences)
 
 
-def ranks_of(differences: np.ndarray) -> np.ndarray:
-    """Whole ranks of what is not zero."""
-    doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)[
-        differences != 0
-    ]
-    return doubled // np.gcd.reduce(doubled)
-
-
 def enumerated_p(differences: np.ndarray) -> float:
     """The signed-rank test by all sign patterns; zeros have a rank and no sign."""
     ranks = stats.rankdata(np.abs(differences))
@@ -258,34 +239,18 @@ def test_the_exact_signed_rank_test_is_that_of_all_sign_patterns(
         assert statistics.signed_rank_p(differences) == pytest.approx(
             enumerated_p(finite(differences)), abs=1e-12
         )
-    for count in (30, 60) if kind == "distinct" else ():
+    for count in (30, 80) if kind == "distinct" else ():
         differences = drawn(kind, count, shift=0.3)
         expected = stats.wilcoxon(differences, method="exact").pvalue
         assert statistics.signed_rank_p(differences) == pytest.approx(
             expected, rel=1e-9
-        )
-    ranks = ranks_of(drawn(kind, 80))
-    counts = np.zeros(ranks.sum() + 1, dtype=object)
-    counts[0] = 1
-    for rank in ranks.tolist():  # in whole numbers
-        counts[rank:] += counts[:-rank].copy()
-    for most in (0, int(0.3 * ranks.sum()), int(0.5 * ranks.sum())):
-        assert statistics.exact_tail(ranks, most) == pytest.approx(
-            sum(counts[: most + 1]) / 2 ** len(ranks), rel=1e-9
         )
 
 
 def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
     assert statistics.signed_rank_p(np.zeros(8)) == 1.0
     assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
-    for pairs in (6, 8):
-        assert statistics.signed_rank_p(np.arange(1.0, 1.0 + pairs)) == 2.0 ** (
-            1 - pairs
-        )
-    assert (
-        statistics.signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0]))
-        == 1.0
-    )
+    assert statistics.signed_rank_p(np.arange(1.0, 7.0)) == 2.0**-5
 
 
 @given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))

@@ -31,19 +31,6 @@ def sensor(said: dict, quantity: str) -> dict:
     return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
 
 
-@pytest.mark.slow
-def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log, tmp_path):
-    (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
-    here = sensor(answer(log), "DVL against IMU: time offset")
-    there = sensor(
-        answer(log, "--log-config", tmp_path / "late.toml"),
-        "DVL against IMU: time offset",
-    )
-    assert there["value"] - here["value"] == pytest.approx(-0.5, abs=there["sigma"])
-    assert there["sigma"] < 0.1
-    assert there["act"]
-
-
 def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
     yaw = sensor(

@@ -11,7 +11,6 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs import write_log
 from sonar_graph.logs.convert import read_csv
 from sonar_graph.measurements import Dvl
-from sonar_graph.states import Trajectory
 from sonar_graph.testing import small_world
 
 IMU = """[imu]
@@ -220,58 +219,6 @@ def test_tables_with_another_unit_of_velocity_are_reported(
         == 0
     )
     assert "unit" not in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("unrendered")
-@pytest.mark.parametrize("command", ["run", "compare"])
-def test_velocities_a_thousand_times_too_large_come_first(
-    run, folder, tmp_path, command, capsys
-):
-    names = ("--estimator" if command == "run" else "--estimators", "dead-reckoning")
-    run(command, folder / "fast.mcap", "-o", tmp_path / "out", *names)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "Doubtful: DVL: unit: velocities look 1000 times too large" in said
-    assert "`scale = 0.001` under [dvl]" in said
-
-
-@pytest.mark.usefixtures("unrendered")
-def test_a_start_that_nobody_stated_is_said_and_errors_are_after_the_fit(
-    run, folder, tmp_path, capsys
-):
-    world = small_world()
-    far = Trajectory.of_positions(
-        world.truth.stamps_ns, world.truth.positions[:, [1, 0, 2]] * [-1, 1, 1] + 5e5
-    )
-    bare = world.calibration.model_copy(
-        update={"start": type(world.calibration.start)()}
-    )
-    bare.model_fields_set.discard("start")
-    write_log(
-        tmp_path / "free.mcap",
-        replace(world, truth=far, calibration=bare, true_landmarks=None),
-    )
-    out = tmp_path / "out"
-    assert (
-        run(
-            "compare",
-            tmp_path / "free.mcap",
-            "-o",
-            out,
-            "--estimators",
-            "dead-reckoning",
-        )
-        == 0
-    )
-    said = " ".join(capsys.readouterr().out.split())
-    assert (
-        "Truth: the log states no start, so the truth was brought into the world of the estimates"
-        in said
-    )
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert (
-        "The log states no start, so the truth was brought into the world of the estimates"
-        in page
-    )
 
 
 def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):

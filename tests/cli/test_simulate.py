@@ -84,15 +84,6 @@ def test_images_and_sensors_are_those_of_the_library(
     assert times_ns == sorted(times_ns)
 
 
-@pytest.mark.slow
-def test_same_seed_gives_the_same_bytes(tmp_path):
-    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
-        simulate(tmp_path / f"{name}.mcap", "--seed", seed)
-    contents = [(tmp_path / f"{name}.mcap").read_bytes() for name in "abc"]
-    assert contents[0] == contents[1]
-    assert contents[0] != contents[2]
-
-
 def test_simulation_flags_and_settings_reach_the_simulator(
     run, tmp_path, monkeypatch, capsys
 ):

@@ -18,26 +18,6 @@ FRD = np.array([1.0, -1.0, -1.0])
 MEASURED = ("imu", "dvl", "depth", "heading", "positions", "detections")
 
 
-def table(
-    path: Path,
-    names: str,
-    *columns: np.ndarray,
-    stamps_ns: np.ndarray | None = None,
-    sep: str = ",",
-) -> None:
-    """Write columns with every bit, and stamps in seconds with every nanosecond."""
-    rows = np.column_stack(columns).tolist()
-    texts = [[repr(value) for value in row] for row in rows]
-    if stamps_ns is not None:
-        texts = [
-            [f"{ns // 10**9}.{ns % 10**9:09d}", *row]
-            for ns, row in zip(stamps_ns.tolist(), texts, strict=True)
-        ]
-    path.write_text(
-        "\n".join([names.replace(",", sep), *(sep.join(row) for row in texts)]) + "\n"
-    )
-
-
 def world():
     """A world with everything that a table can hold, with covariances that tables do not have taken out."""
     small = small_world()
@@ -64,78 +44,48 @@ def world():
     )
 
 
-def write_tables(folder: Path, s, *, frd: bool = False, sep: str = ",") -> None:
-    """Tables of a sequence; with ``frd`` in degrees, g and mm, along forward, right, down and north, east, down."""
+def columns_of(s, frd: bool) -> dict:
+    """Stamps, names and columns by role; with ``frd`` in degrees, g and mm, along forward, right, down and NED."""
     turn, rate, force, mm = (
         (FRD, 180 / np.pi, 1 / 9.80665, 1e3) if frd else (np.ones(3), 1.0, 1.0, 1.0)
     )
-    world_of = (lambda p: p[:, [1, 0, 2]] * [1, 1, -1]) if frd else (lambda p: p)
-    of_imu = (s.imu.angular_velocity * turn * rate, s.imu.specific_force * turn * force)
-    table(
-        folder / "imu.csv",
-        "t,wx,wy,wz,ax,ay,az",
-        *of_imu,
-        stamps_ns=s.imu.stamps_ns,
-        sep=sep,
-    )
-    table(
-        folder / "dvl.csv",
-        "t,vx,vy,vz",
-        s.dvl.velocity * turn * mm,
-        stamps_ns=s.dvl.stamps_ns,
-        sep=sep,
-    )
-    table(
-        folder / "depth.csv",
-        "t,d",
-        s.depth.z_m * (-mm if frd else 1.0),
-        stamps_ns=s.depth.stamps_ns,
-        sep=sep,
-    )
-    yaw = np.degrees(np.pi / 2 - s.heading.yaw_rad) if frd else s.heading.yaw_rad
-    table(folder / "heading.csv", "t,yaw", yaw, stamps_ns=s.heading.stamps_ns, sep=sep)
-    place = world_of(s.positions.position_m) * mm
-    table(
-        folder / "fix.csv", "t,x,y,z", place, stamps_ns=s.positions.stamps_ns, sep=sep
-    )
+
+    def place(p: np.ndarray) -> np.ndarray:
+        return mm * (p[:, [1, 0, 2]] * [1, 1, -1] if frd else p)
+
     seen = s.detections
-    k = s.detections.candidate_ids.shape[1]
+    k = range(seen.candidate_ids.shape[1])
+    names = ["range", "azimuth", *(f"id{i}" for i in k), *(f"p{i}" for i in k), "track"]
     azimuth = -np.degrees(seen.azimuth_rad) if frd else seen.azimuth_rad
-    names = ",".join(
-        [
-            "t",
-            "range",
-            "azimuth",
-            *(f"id{i}" for i in range(k)),
-            *(f"p{i}" for i in range(k)),
-            "track",
-        ]
-    )
-    rows = (
-        seen.range_m * mm,
-        azimuth,
-        seen.candidate_ids,
-        seen.id_probability,
-        seen.track,
-    )
-    table(folder / "seen.csv", names, *rows, stamps_ns=seen.stamps_ns, sep=sep)
-    true = world_of(s.truth.positions) * mm
-    table(
-        folder / "truth.csv",
-        "t,x,y,z,qx,qy,qz,qw",
-        true,
-        quaternions(s, frd),
-        stamps_ns=s.truth.stamps_ns,
-        sep=sep,
-    )
+    of_imu = s.imu.angular_velocity * turn * rate, s.imu.specific_force * turn * force
+    of_sonar = seen.range_m * mm, azimuth, seen.candidate_ids, seen.id_probability
+    yaw = np.degrees(np.pi / 2 - s.heading.yaw_rad) if frd else s.heading.yaw_rad
+    poses = place(s.truth.positions), quaternions(s, frd)
     known = s.true_landmarks
-    table(
-        folder / "map.csv",
-        "id,x,y,z",
-        known.ids,
-        world_of(known.positions) * mm,
-        sep=sep,
-    )
+    return {
+        "imu": (s.imu, "wx,wy,wz,ax,ay,az", *of_imu),
+        "dvl": (s.dvl, "vx,vy,vz", s.dvl.velocity * turn * mm),
+        "depth": (s.depth, "d", s.depth.z_m * (-mm if frd else 1.0)),
+        "heading": (s.heading, "yaw", yaw),
+        "positions": (s.positions, "x,y,z", place(s.positions.position_m)),
+        "detections": (seen, ",".join(names), *of_sonar, seen.track),
+        "truth": (s.truth, "x,y,z,qx,qy,qz,qw", *poses),
+        "true_landmarks": (None, "id,x,y,z", known.ids, place(known.positions)),
+    }
+
+
+def write_tables(folder: Path, s, *, frd: bool = False, sep: str = ",") -> None:
+    """Write columns with every bit, and stamps in seconds with every nanosecond."""
+    for role, (stamped, names, *columns) in columns_of(s, frd).items():
+        lines = [names.split(",")]
+        lines += [list(map(repr, row)) for row in np.column_stack(columns).tolist()]
+        if stamped is not None:
+            stamps = [
+                f"{n // 10**9}.{n % 10**9:09d}" for n in stamped.stamps_ns.tolist()
+            ]
+            lines = [[t, *line] for t, line in zip(["t", *stamps], lines, strict=True)]
+        text = "\n".join(map(sep.join, lines))
+        (folder / f"{role}.csv").write_text(text + "\n")
 
 
 def quaternions(s, frd: bool) -> np.ndarray:
@@ -147,8 +97,28 @@ def quaternions(s, frd: bool) -> np.ndarray:
     return Rotation.from_matrix(enu_R_ned.T @ s.truth.matrices @ np.diag(FRD)).as_quat()
 
 
+NED_MM = {"scale": "mm", "world": "ned"}
+UNITS = {
+    "imu": {
+        "angular_velocity_scale": "deg/s",
+        "linear_acceleration_scale": "g",
+        "rotation": "frd",
+    },
+    "dvl": {"scale": "mm/s", "rotation": "frd"},
+    "depth": {"scale": -0.001},
+    "heading": {"scale": "deg", "world": "ned"},
+    "positions": NED_MM,
+    "detections": {"range_scale": "mm", "azimuth_scale": "deg", "rotation": "frd"},
+    "truth": NED_MM | {"rotation": "frd"},
+    "true_landmarks": NED_MM,
+}
+"""Units and axes of a foreign vehicle."""
+
+
 def configuration(s, *, frd: bool = False) -> dict:
-    k = s.detections.candidate_ids.shape[1]
+    k = range(s.detections.candidate_ids.shape[1])
+    place = {"position": ["x", "y", "z"]}
+    seen = {name: name for name in ("range", "azimuth", "track")}
     tables = {
         "imu": {
             "angular_velocity": ["wx", "wy", "wz"],
@@ -157,66 +127,26 @@ def configuration(s, *, frd: bool = False) -> dict:
         "dvl": {"velocity": ["vx", "vy", "vz"]},
         "depth": {"height": "d"},
         "heading": {"yaw": "yaw"},
-        "positions": {"file": "fix.csv", "position": ["x", "y", "z"]},
-        "detections": {
-            "file": "seen.csv",
-            "range": "range",
-            "azimuth": "azimuth",
-            "track": "track",
-        }
-        | {
-            "ids": [f"id{i}" for i in range(k)],
-            "probabilities": [f"p{i}" for i in range(k)],
-        },
-        "truth": {"position": ["x", "y", "z"], "orientation": ["qx", "qy", "qz", "qw"]},
-        "true_landmarks": {"file": "map.csv", "id": 1, "position": [2, 3, 4]},
+        "positions": place,
+        "detections": seen
+        | {"ids": [f"id{i}" for i in k], "probabilities": [f"p{i}" for i in k]},
+        "truth": place | {"orientation": ["qx", "qy", "qz", "qw"]},
+        "true_landmarks": {"id": 1, "position": [2, 3, 4]},
     }
-    if frd:
-        tables["imu"] |= {
-            "angular_velocity_scale": "deg/s",
-            "linear_acceleration_scale": "g",
-            "rotation": "frd",
-        }
-        tables["dvl"] |= {"scale": "mm/s", "rotation": "frd"}
-        tables["depth"] |= {"scale": -0.001}
-        tables["heading"] |= {"scale": "deg", "world": "ned"}
-        tables["positions"] |= {"scale": "mm", "world": "ned"}
-        tables["detections"] |= {
-            "range_scale": "mm",
-            "azimuth_scale": "deg",
-            "rotation": "frd",
-        }
-        tables["truth"] |= {"scale": "mm", "world": "ned", "rotation": "frd"}
-        tables["true_landmarks"] |= {"scale": "mm", "world": "ned"}
     return {"stamp": "t"} | {
-        role: {"file": f"{role}.csv"} | keys for role, keys in tables.items()
+        role: {"file": f"{role}.csv"} | keys | (UNITS[role] if frd else {})
+        for role, keys in tables.items()
     }
 
 
 def assert_same(found, expected, atol: float) -> None:
-    for role in MEASURED:
-        for name, column in vars(getattr(expected, role)).items():
-            np.testing.assert_allclose(
-                getattr(getattr(found, role), name),
-                column,
-                rtol=0,
-                atol=atol,
-                err_msg=role,
-            )
-    np.testing.assert_array_equal(found.truth.stamps_ns, expected.truth.stamps_ns)
-    np.testing.assert_allclose(
-        found.truth.positions, expected.truth.positions, rtol=0, atol=atol
-    )
-    np.testing.assert_allclose(
-        found.truth.matrices, expected.truth.matrices, rtol=0, atol=atol
-    )
-    np.testing.assert_array_equal(found.true_landmarks.ids, expected.true_landmarks.ids)
-    np.testing.assert_allclose(
-        found.true_landmarks.positions,
-        expected.true_landmarks.positions,
-        rtol=0,
-        atol=atol,
-    )
+    names = {role: list(vars(getattr(expected, role))) for role in MEASURED}
+    names["truth"] = ["stamps_ns", "positions", "matrices"]
+    names["true_landmarks"] = ["ids", "positions"]
+    for role, columns in names.items():
+        for name in columns:
+            got, wanted = (getattr(getattr(s, role), name) for s in (found, expected))
+            np.testing.assert_allclose(got, wanted, rtol=0, atol=atol, err_msg=role)
 
 
 @pytest.mark.parametrize("sep", [",", ";", "\t", " "])
@@ -245,6 +175,14 @@ def test_units_and_axes_of_a_foreign_vehicle_are_turned_into_ours(tmp_path):
         assert_same(read_csv(tmp_path, configuration(expected)), expected, 1e-9)
 
 
+TRIPLE = ["a", "b", "c"]
+OF_IMU = {
+    "file": "imu.csv",
+    "angular_velocity": TRIPLE,
+    "linear_acceleration": TRIPLE,
+}
+
+
 @pytest.mark.parametrize(
     ("unit", "number"),
     [("s", "1893456000.123456789"), ("ms", "1893456000123.456789"), ("us", "1893456000123456.789"),
@@ -255,16 +193,8 @@ def test_units_and_axes_of_a_foreign_vehicle_are_turned_into_ours(tmp_path):
 def test_stamps_of_every_unit_keep_their_nanoseconds(tmp_path, unit, number):
     for name in ("imu", "dvl"):
         (tmp_path / f"{name}.csv").write_text(f"time,a,b,c\n{number},0,0,1\n")
-    triple = ["a", "b", "c"]
-    config = {
-        "stamp_unit_s": unit,
-        "imu": {
-            "file": "imu.csv",
-            "angular_velocity": triple,
-            "linear_acceleration": triple,
-        },
-    }
-    config |= {"stamp_offset_s": -0.5, "dvl": {"file": "dvl.csv", "velocity": triple}}
+    config = {"stamp_unit_s": unit, "stamp_offset_s": -0.5, "imu": OF_IMU}
+    config |= {"dvl": {"file": "dvl.csv", "velocity": TRIPLE}}
     found = read_csv(tmp_path, config)
     assert (
         found.imu.stamps_ns.tolist()
@@ -364,19 +294,12 @@ def test_truth_from_roll_pitch_yaw_and_units_of_receivers(
     (tmp_path / "gt.csv").write_text(
         f"time,lat,lon,r,p,y\n0,{first},0,0,90\n9,{last},10,20,-30\n"
     )
-    triple = ["a", "b", "c"]
+    geodetic = {"latitude": "lat", "longitude": "lon", "unit": unit}
     config = {
-        "imu": {
-            "file": "imu.csv",
-            "angular_velocity": triple,
-            "linear_acceleration": triple,
-        },
-        "dvl": {"file": "imu.csv", "velocity": triple},
-        "truth": {
-            "file": "gt.csv",
-            "geodetic": {"latitude": "lat", "longitude": "lon", "unit": unit},
-        }
-        | {"rpy": ["r", "p", "y"], "rpy_scale": "deg"},
+        "imu": OF_IMU,
+        "dvl": {"file": "imu.csv", "velocity": TRIPLE},
+        "truth": {"file": "gt.csv", "geodetic": geodetic, "rpy_scale": "deg"}
+        | {"rpy": ["r", "p", "y"]},
     }
     truth = read_csv(tmp_path, config).truth
     assert truth.positions[1] == pytest.approx([0, 1852, 0], abs=3)

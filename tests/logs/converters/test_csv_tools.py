@@ -116,37 +116,49 @@ def plain(folder: Path, d: SimpleNamespace, *names: str, scale: float = 1.0) -> 
         write(folder / "depth.csv", "time,depth", t[k], d.depth[k])
 
 
-def test_excel_in_german_with_semicolons_decimal_commas_and_degree_signs(
-    folder, tmp_path
-):
+def comma(value: float) -> str:
+    return repr(value).replace(".", ",")
+
+
+TOOLS = {
+    "Excel in German": (
+        '"Zeit";"Gyro X (°/s)";"Gyro Y (°/s)";"Gyro Z (°/s)";"Acc X [g]";"Acc Y [g]";"Acc Z [g]"',
+        '"Zeit";"Vel X [cm/s]";"Vel Y [cm/s]";"Vel Z [cm/s]";"Tiefe [m]"',
+        "%d.%m.%Y %H:%M:%S,@",
+        (1 / 9.80665, 100, 1),
+        {"sep": ";", "number": comma, "encoding": "cp1252"},
+    ),
+    "writetable of MATLAB": (
+        "Time,gyro_x_deg_s_,gyro_y_deg_s_,gyro_z_deg_s_,acc_x_m_s2_,acc_y_m_s2_,acc_z_m_s2_",
+        "Time,vel_x_mm_s_,vel_y_mm_s_,vel_z_mm_s_,depth_m_",
+        "%d-%b-%Y %H:%M:%S.@",
+        (1, 1000, 1),
+        {},
+    ),
+    "a second line with units": (
+        "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg",
+        "Time;VelX;VelY;VelZ;Depth\nms;mm/s;mm/s;mm/s;cm",
+        None,
+        (1 / 9.80665e-3, 1000, 100),
+        {"sep": ";"},
+    ),
+}
+"""Headers of IMU and Doppler log, dates, factors of forces, velocities and depths, and form; rates are in degrees."""
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool):
     d = dive()
     k = d.slow
-
-    def comma(value: float) -> str:
-        return repr(value).replace(".", ",")
-
-    how = {"sep": ";", "number": comma, "encoding": "cp1252"}
-    stamps = dates(d.s, "%d.%m.%Y %H:%M:%S,@")
-    header = '"Zeit";"Gyro X (°/s)";"Gyro Y (°/s)";"Gyro Z (°/s)";"Acc X [g]";"Acc Y [g]";"Acc Z [g]"'
-    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665).T)
-    write(folder / "imu.csv", header, stamps, *columns, **how)
-    header = '"Zeit";"Vel X [cm/s]";"Vel Y [cm/s]";"Vel Z [cm/s]";"Tiefe [m]"'
-    columns = (*(100 * d.velocity[k]).T, d.depth[k])
-    write(folder / "dvl.csv", header, stamps[k], *columns, **how)
-    _, config = template(folder)
-    assert (config["imu"]["decimal"], config["imu"]["encoding"]) == (",", "cp1252")
-    assert_is(guessed(folder, tmp_path), d)
-
-
-def test_matlab_writetable_with_its_dates_and_mangled_units(folder, tmp_path):
-    d = dive()
-    k = d.slow
-    stamps = dates(d.s, "%d-%b-%Y %H:%M:%S.@")
-    header = "Time,gyro_x_deg_s_,gyro_y_deg_s_,gyro_z_deg_s_,acc_x_m_s2_,acc_y_m_s2_,acc_z_m_s2_"
-    write(folder / "imu.txt", header, stamps, *np.degrees(d.rate).T, *d.force.T)
-    header = "Time,vel_x_mm_s_,vel_y_mm_s_,vel_z_mm_s_,depth_m_"
-    columns = (*(1000 * d.velocity[k]).T, d.depth[k])
-    write(folder / "dvl.txt", header, stamps[k], *columns)
+    of_imu, of_dvl, form, (force, velocity, depth), how = TOOLS[tool]
+    stamps = 1e3 * d.s if form is None else dates(d.s, form)
+    columns = (*np.degrees(d.rate).T, *(force * d.force).T)
+    write(folder / "imu.csv", of_imu, stamps, *columns, **how)
+    columns = (*(velocity * d.velocity[k]).T, depth * d.depth[k])
+    write(folder / "dvl.csv", of_dvl, stamps[k], *columns, **how)
+    imu = template(folder)[1]["imu"]
+    if "encoding" in how:
+        assert (imu["decimal"], imu["encoding"]) == (",", "cp1252")
     assert_is(guessed(folder, tmp_path), d)
 
 
@@ -256,19 +268,6 @@ def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path
     write(folder / "ctd.csv", "time;Pressure (dbar)", d.s[k], decibar, sep=";")
     depth_m = -guessed(folder, tmp_path).depth.z_m
     np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
-
-
-def test_a_second_line_of_the_header_with_units(folder, tmp_path):
-    d = dive()
-    k = d.slow
-    header = "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg"
-    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665e-3).T)
-    write(folder / "imu.csv", header, 1e3 * d.s, *columns, sep=";")
-    header = "Time;VelX;VelY;VelZ\nms;mm/s;mm/s;mm/s"
-    write(folder / "dvl.csv", header, 1e3 * d.s[k], *(1e3 * d.velocity[k]).T, sep=";")
-    header = "Time;Depth\nms;cm"
-    write(folder / "depth.csv", header, 1e3 * d.s[k], 100 * d.depth[k], sep=";")
-    assert_is(guessed(folder, tmp_path), d)
 
 
 def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
