@@ -133,31 +133,24 @@ def test_a_lost_or_foreign_row_counts_as_not_done(
 def test_files_of_others_are_never_removed(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
-    (store.run_folder("k") / "log.txt").write_text("mine")
-    for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
-        with pytest.raises(
-            BatchError,
-            match=r"runs/k: would be replaced, and holds log\.txt, .*move it away",
-        ):
-            act()
-    assert (store.run_folder("k") / "log.txt").read_text() == "mine"
-    (store.run_folder("k") / "log.txt").write_text(OUTCOME.log)
-    notes = [
-        store.run_folder("k") / "notes.txt",
+    folder = store.run_folder("k")
+    others = [
+        folder / "notes.txt",
         *(tmp_path / "runs" / name / "a" for name in ("mine", ".partial-mine")),
     ]
-    for path in notes:
+    for path in others:
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
-    for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
-        with pytest.raises(
-            BatchError,
-            match=r"runs/k: would be replaced, and holds notes\.txt, .*move it away",
-        ):
-            act()
+    (folder / "log.txt").write_text("mine")
+    for name in ("log.txt", "notes.txt"):
+        told = rf"runs/k: would be replaced, and holds {name}, .*move it away"
+        for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
+            with pytest.raises(BatchError, match=told):
+                act()
+        (folder / "log.txt").write_text(OUTCOME.log)
     store.remove_partial()
-    assert [path.read_text() for path in notes] == ["mine"] * 3
+    assert [path.read_text() for path in others] == ["mine"] * 3
     assert store.row("k") == OUTCOME.row
-    notes[0].unlink()
+    others[0].unlink()
     store.discard("k")
-    assert not store.run_folder("k").exists()
+    assert not folder.exists()

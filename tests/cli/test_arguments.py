@@ -18,7 +18,6 @@ from sonar_graph.cli.arguments import (
     parse_settings,
     with_options,
 )
-from sonar_graph.logs import PartialCalibration
 
 
 @given(
@@ -55,22 +54,9 @@ def test_settings_go_to_their_estimator_at_any_depth():
     }
 
 
-def test_topics_go_to_their_roles(
-    tmp_path,
-):
-    assert ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"]).choices == {
-        "imu": "/imu/data",
-        "dvl": "/a=b",
-    }
-    for name, text in (
-        ("a.toml", "[imu]\ngyro_bias_sigma = 0.5\n"),
-        ("a.json", '{"imu": {"gyro_bias_sigma": 0.5}}'),
-    ):
-        (tmp_path / name).write_text(text)
-        given = ReadingOptions(calibration=tmp_path / name).given
-        assert given == PartialCalibration(
-            {"imu": {"gyro_bias_sigma": 0.5}}, str(tmp_path / name)
-        )
+def test_topics_go_to_their_roles():
+    options = ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"])
+    assert options.choices == {"imu": "/imu/data", "dvl": "/a=b"}
 
 
 def test_fields_of_a_group_are_options():

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,45 +16,25 @@ from sonar_graph.cli.compare import DEMO
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation import read_comparison
 from sonar_graph.logs import read_log, write_log
-from sonar_graph.measurements import NS_PER_S, Heading, PositionFixes
-from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, cruise_speed
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS
 
 
-@pytest.fixture(scope="module")
-def compared(run, basin_content, tmp_path_factory):
-    """What ``compare`` writes for a log."""
-    folder = tmp_path_factory.mktemp("compared")
-    log = folder / "basin.mcap"
-    log.write_bytes(basin_content)
-    assert run("compare", log, "-o", folder / "out", "--rate-hz", "1") == 0
-    return folder / "out"
-
-
-def test_compare_writes_report_numbers_results_and_runs(compared):
-    for name in (
-        "report.html",
-        "comparison.json",
-        "result.mcap",
-        "result.foxglove.json",
-        "result.rviz",
-    ):
-        assert (compared / name).stat().st_size > 1000
-    for estimator in ("isam2", "ekf-slam", "dead-reckoning"):
-        there = {path.name for path in (compared / "runs" / estimator).iterdir()}
-        assert {"trajectory.tum", "causal.tum", "landmarks.csv"} <= there
-
-
-def test_compare_names_the_report_and_report_draws_it_again(
-    run, dive, tmp_path, capsys
+def test_compare_writes_what_it_names_and_report_draws_it_again(
+    run, basin, tmp_path, capsys
 ):
-    assert run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
+    assert run("compare", basin, "-o", tmp_path, "--rate-hz", "1") == 0
     told = capsys.readouterr()
     page = tmp_path / "report.html"
     assert f"Report: {page}" in told.out.splitlines()
-    assert "dead-reckoning" in told.out
     assert told.err == ""
+    results = "comparison.json", "result.mcap", "result.foxglove.json", "result.rviz"
+    for name in ("report.html", *results):
+        assert (tmp_path / name).stat().st_size > 1000
+    for estimator in ("isam2", "ekf-slam", "dead-reckoning"):
+        assert estimator in told.out
+        there = {path.name for path in (tmp_path / "runs" / estimator).iterdir()}
+        assert {"trajectory.tum", "causal.tum", "landmarks.csv"} <= there
     before = page.read_text()
     page.unlink()
     assert run("report", tmp_path) == 0
@@ -145,13 +124,6 @@ def test_run_uses_the_given_calibration_field_by_field(run, dive, tmp_path):
     assert [path.name for path in (tmp_path / "out" / "runs").iterdir()] == [
         "dead-reckoning"
     ]
-    first = (
-        (tmp_path / "out" / "runs" / "dead-reckoning" / "causal.tum")
-        .read_text()
-        .splitlines()[1]
-        .split()
-    )
-    assert float(first[1]) == pytest.approx(100, abs=3)
     of_log, changed = calibrations
     assert changed["start"].pop("position_m") != of_log["start"].pop("position_m")
     assert changed == of_log
@@ -161,58 +133,22 @@ def test_run_uses_the_given_calibration_field_by_field(run, dive, tmp_path):
     )
 
 
-def degrees(sequence: Sequence) -> Sequence:
-    return replace(
-        sequence,
-        imu=replace(
-            sequence.imu, angular_velocity=np.degrees(sequence.imu.angular_velocity)
-        ),
-    )
-
-
-def aided(sequence: Sequence, sense: float = 1.0) -> Sequence:
-    """With a compass and position fixes of the truth."""
-    truth = sequence.truth.at(
-        np.arange(sequence.start_ns, sequence.truth.stamps_ns[-1], NS_PER_S)
-    )
-    heading = Heading(
-        truth.stamps_ns,
-        sense * truth.rotations().as_euler("ZYX")[:, 0],
-        np.full(len(truth), np.nan),
-    )
-    fixes = PositionFixes(
-        truth.stamps_ns, truth.positions, np.full((len(truth), 3, 3), np.nan)
-    )
-    return replace(sequence, heading=heading, positions=fixes)
-
-
 @pytest.mark.usefixtures("unrendered")
-@pytest.mark.parametrize(
-    ("spoil", "told"),
-    [
-        (degrees, "gyro: unit: rates look 57 times too large"),
-        (partial(aided, sense=-1.0), "heading: turn over that of the gyros: -1.00"),
-        (aided, None),
-    ],
-)
-def test_run_and_compare_begin_with_grave_findings(
-    run, basin, tmp_path, capsys, spoil, told
-):
+def test_run_and_compare_begin_with_grave_findings(run, basin, tmp_path, capsys):
     """Before what follows from it: refused rows, and a map that is far off."""
     log = tmp_path / "spoilt.mcap"
     out = tmp_path / "out"
-    write_log(log, spoil(read_log(basin)))
-    told_in = []
+    sequence = read_log(basin)
+    degrees = np.degrees(sequence.imu.angular_velocity)
+    imu = replace(sequence.imu, angular_velocity=degrees)
+    write_log(log, replace(sequence, imu=imu))
+    told = []
     for command, option in (("run", "--estimator"), ("compare", "--estimators")):
-        assert run(command, log, option, "ekf-slam", "-o", out) == (3 if told else 0)
-        told_in.append(capsys.readouterr().out)
-    for text in (*told_in, (out / "report.html").read_text()):
-        if told:
-            assert text.partition("Doubtful: ")[2].startswith(told)
-        else:
-            assert not re.search(
-                "turn over that of the gyros|position fixes: (unit|change)", text
-            )
+        assert run(command, log, option, "ekf-slam", "-o", out) == 3
+        told.append(capsys.readouterr().out)
+    for text in (*told, (out / "report.html").read_text()):
+        _, _, first = text.partition("Doubtful: ")
+        assert first.startswith("gyro: unit: rates look 57 times too large")
 
 
 def test_estimators_lists_every_setting(run, capsys):
