@@ -232,23 +232,6 @@ def test_failed_runs_are_kept_until_they_are_discarded(
         assert statuses_after(batch) == {"ok": 4}
 
 
-def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path):
-    folder = tmp_path / "out"
-    with Batch.opened(read_suite(suite), folder) as batch:
-        half_written = folder / "runs" / f".partial-{batch.runs[0].key}-0123abcd"
-        half_written.mkdir()
-        suite.write_text(suite.read_text().replace("short", "other"))
-        with (
-            pytest.raises(BatchError, match="another command is writing"),
-            Batch.opened(read_suite(suite), folder),
-        ):
-            pass
-        assert half_written.is_dir()
-        assert not (folder / "suite.toml").exists()
-    with Batch.opened(read_suite(suite), folder):
-        assert not half_written.exists()
-
-
 def kill(
     suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -101,10 +101,3 @@ def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
     topics = {topic["name"] for topic in answer(basin, "--quick")["topics"]}
     assert len(topics) == 2 + int(hidden)
     assert sum(f"\n{name} " in shown for name in topics) == 2
-
-
-def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
-    log = tmp_path / "victoria_park.mcap"
-    assert run("convert", "dataset", "victoria-park", "-o", log) == 0
-    assert "3640 landmark detections" in capsys.readouterr().out
-    assert run("inspect", log) == 0

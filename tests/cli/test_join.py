@@ -233,15 +233,3 @@ def converted(run, recorded: Path) -> Path:
     out = recorded.with_suffix(".mcap")
     assert run("convert", "aris", recorded, "-o", out) == 0
     return out
-
-
-def test_navigation_that_has_images_is_refused_before_reading_others(
-    lane_log, run, tmp_path, capsys
-):
-    nothing = tmp_path / "none.aris"
-    nothing.write_bytes(b"")
-    assert run("join", nothing, lane_log, "-o", tmp_path / "joined.mcap") == 2
-    assert (
-        f"{lane_log}: has /sonar/image already; recognise it as it is"
-        in capsys.readouterr().err
-    )

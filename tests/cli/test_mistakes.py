@@ -150,6 +150,7 @@ MISTAKES = {
     "calibrate lane.mcap -o new.json --labels labels.json --labels labels.json": "1 logs and 2 files for --labels; give",
     "calibrate lane.mcap -o new.json --labels twelve.json": "its labels name landmark 12, the designs are 1, 2, 3, 4",
     "calibrate lane.mcap -o new.json --motion images": "--motion is for --labels",
+    "join notes.txt lane.mcap -o new.mcap": r"lane\.mcap: has /sonar/image already; recognise it as it is",
     "label lane.mcap -o new.toml": r"expected the name of a file that ends in \.json",
     "recognise lane.mcap -o new.mcap --report page.pdf": r"expected the name of a file that ends in \.html",
     "calibrate lane.mcap -o new.json --set identity.unknown_pror=1": r"identity\.unknown_pror: .*unknown_prior",

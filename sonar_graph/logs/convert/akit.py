@@ -60,17 +60,6 @@ REFERENCE_COLUMNS = (
 )
 
 
-def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
-    """Rotation of world (east, north, up) from body (forward, left, up), from north-east-down angles.
-
-    ``enu_R_ned Rz(yaw) Ry(pitch) Rx(roll) frd_R_flu``.
-    """
-    ned_R_frd = Rotation.from_euler(
-        "ZYX", np.column_stack([yaw_rad, pitch_rad, roll_rad])
-    ).as_matrix()
-    return Rotation.from_matrix(ENU_R_NED @ ned_R_frd @ np.diag(FLU_OF_FRD))
-
-
 def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
     """Seconds to add to the reference's stamps so that it turns when the gyros do; 0 where the best is the last tried.
 
@@ -151,7 +140,10 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     unknown = np.full((len(dvl_ns), 3, 3), np.nan)
     dvl = Dvl(DVL_DELAY_NS + dvl_ns, velocity, unknown)
     longitude, latitude, altitude = reference_rows[:, 1:4].T
-    quaternions = enu_R_flu(*reference_rows[:, 7:10].T).as_quat()
+    # roll, pitch and yaw of north-east-down: enu_R_ned Rz(yaw) Ry(pitch) Rx(roll) frd_R_flu
+    ned_R_frd = Rotation.from_euler("ZYX", reference_rows[:, 9:6:-1]).as_matrix()
+    enu_R_flu = ENU_R_NED @ ned_R_frd @ np.diag(FLU_OF_FRD)
+    quaternions = Rotation.from_matrix(enu_R_flu).as_quat()
     origin = (float(latitude[0]), float(longitude[0]), 0.0)
     positions = east_north_up(latitude, longitude, altitude, origin)
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)

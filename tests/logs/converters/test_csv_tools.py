@@ -162,24 +162,6 @@ def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool):
     assert_is(guessed(folder, tmp_path), d)
 
 
-def test_linkquest_navquest_whose_flag_marks_rows_without_lock(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "depth")
-    k = d.slow
-    flag = np.ones(ROWS)[k]
-    flag[20:30] = 0
-    velocity = np.round(1000 * d.velocity[k]) * flag[:, None]
-    header = "time velo_x velo_y velo_z velo_flag altitude"
-    columns = (d.s[k], *velocity.T, flag, np.full(len(flag), 12.5))
-    write(folder / "navquest.txt", header, *columns, sep=" ")
-    assert template(folder)[1]["dvl"]["scale"] == "mm/s"
-    sequence = guessed(folder, tmp_path)
-    assert len(sequence.dvl) == len(flag) - 10
-    np.testing.assert_allclose(
-        sequence.dvl.velocity, d.velocity[k][flag == 1], atol=1e-3
-    )
-
-
 def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
     d = dive(imu_hz=10.0, every=1)
     stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@")
@@ -311,22 +293,28 @@ def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
         guessed(folder, tmp_path)
 
 
+@pytest.mark.parametrize(("name", "held"), [("velocity_valid", 1), ("velo_flag", 0)])
 def test_a_column_of_validity_is_proposed_and_missed_where_it_is_not_used(
-    folder, tmp_path
+    folder, tmp_path, name, held
 ):
+    """By its name, or by velocities that are zero in the marked rows; the header has no unit."""
     d = dive()
     plain(folder, d, "imu", "depth")
     k = d.slow
-    marks = ["false" if 10 <= row < 20 else "true" for row in range(len(d.s[k]))]
-    header = "time,vel_x,vel_y,vel_z,velocity_valid"
-    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T, marks)
+    is_lost = np.isin(np.arange(len(d.s[k])), range(10, 20))
+    velocity = 1000 * d.velocity[k] * np.where(is_lost, held, 1)[:, None]
+    marks = np.where(is_lost, "false", "true").tolist()
+    header = f"time,vel_x,vel_y,vel_z,{name}"
+    write(folder / "dvl.csv", header, d.s[k], *velocity.T, marks)
     config = template(folder)[1]
-    assert config["dvl"]["valid_where"] == {"velocity_valid": 1}
-    assert len(guessed(folder, tmp_path).dvl) == len(marks) - 10
+    assert config["dvl"]["valid_where"] == {name: 1}
+    assert config["dvl"]["scale"] == "mm/s"
+    found = guessed(folder, tmp_path).dvl.velocity
+    np.testing.assert_allclose(found, d.velocity[k][~is_lost], atol=1e-9)
     del config["dvl"]["valid_where"]
     warning = read_csv(folder, config).notes["csv.warnings"]
-    assert "column velocity_valid is 0 in 10 of 60 rows and not used" in warning
-    assert "`valid_where = {velocity_valid = 1}`" in warning
+    assert f"column {name} is 0 in 10 of 60 rows and not used" in warning
+    assert f"`valid_where = {{{name} = 1}}`" in warning
 
 
 def test_a_sonar_without_identities_states_it_by_false(folder):
