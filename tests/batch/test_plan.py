@@ -164,15 +164,6 @@ def test_an_estimator_of_another_package_has_the_hash_of_that_package(
     assert (run.params, run.versions["estimator_source"]) == ({"a": 1}, "")
 
 
-def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite):
-    text = 'params = { identity.policy = "max-mixture" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
-    with pytest.raises(
-        BatchError,
-        match=r'line 11: estimators\.0\.grid\.history: .*"max-mixture", which chooses anew',
-    ):
-        planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
-
-
 def test_the_request_is_the_suite_with_files_by_content(write_suite, tmp_path):
     grid = "grid = { wrong_id_rate = [0.1] }\n"
     params = "params = { smoother.lag_s = 14 }\n"

@@ -76,31 +76,21 @@ def test_quantile_of_finite_values_is_numpys(values, share):
 
 
 def test_missing_runs_lie_at_the_ends_of_quantiles():
-    for values, share, expected in (
-        *(
-            ([1.0, 2.0, 3.0, INF, INF], 0.5, 3.0),
-            ([1.0, 2.0, INF, INF], 0.5, INF),
-            ([INF, 1.0], 0.1, INF),
-        ),
-        *(
-            ([-INF, 1.0], 0.5, -INF),
-            ([-INF, -INF, 1.0, 2.0], 0.5, -INF),
-            ([-INF, 1.0, 2.0], 0.5, 1.0),
-        ),
-        *(([], 0.5, math.nan), ([-INF, INF], 0.5, math.nan)),
+    for values, expected in (
+        ([1.0, 2.0, 3.0, INF, INF], 3.0),
+        ([1.0, 2.0, INF, INF], INF),
+        ([-INF, 1.0], -INF),
+        ([-INF, 1.0, 2.0], 1.0),
+        ([], math.nan),
+        ([-INF, INF], math.nan),
     ):
-        assert statistics.quantile(np.array(values), share) == pytest.approx(
-            expected, nan_ok=True
-        ), values
-    complete, short = (
-        statistics.summarise(np.array([1.0, 2.0, third, 4.0])) for third in (3.0, INF)
-    )
-    assert (complete.mean, complete.standard_error) == (
-        2.5,
-        pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0])),
-    )
-    assert math.isnan(short.mean)
-    assert math.isnan(short.standard_error)
+        found = statistics.quantile(np.array(values), 0.5)
+        assert found == pytest.approx(expected, nan_ok=True), values
+    complete = statistics.summarise(np.array([1.0, 2.0, 3.0, 4.0]))
+    sem = pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0]))
+    assert (complete.mean, complete.standard_error) == (2.5, sem)
+    short = statistics.summarise(np.array([1.0, 2.0, INF, 4.0]))
+    assert np.isnan([short.mean, short.standard_error]).all()
     assert (short.runs, short.without, short.median) == (4, 1, 3.0)
 
 
@@ -126,7 +116,6 @@ PAIRS = [
     ([INF, 1],                [INF, 2],               None,                  "2 pairs", 1, 1, -0.5,     math.nan),
     ([INF, 1, INF, 1],        [1, INF, 1, INF],       None,                  "4 pairs", 4, 2, math.nan, math.nan),
     ([1, 2],                  [0, 0],                 [3, 3],                "1 seed",  0, 0, 1.5,      1.5),
-    ([1, 2],                  [0, 0],                 [3, 4],                "2 seeds", 0, 0, 1.5,      1.5),
     ([1, 2],                  [0, 0],                 ["a", "b"],            "2 logs",  0, 0, 1.5,      1.5),
     ([1, 2, 3],               [0, 0, 0],              [1, 2, "a"],           "3 cases", 0, 0, 2.0,      2.0),
     ([1, INF, 2, 3],          [0, 0, 0, 0],           [0, 0, 1, 1],          "2 seeds", 1, 0, INF,      math.nan),
@@ -158,22 +147,16 @@ def test_pairs_of_one_case_make_one_difference(
     ],
 )
 def test_anees_of_consistent_runs_lies_in_its_band(scale, verdict, least, most):
-    rng = np.random.default_rng(6)
-    found = np.mean(
-        [
-            statistics.anees(scale * rng.chisquare(2, 15) / 2, 2).verdict == verdict
-            for _ in range(400)
-        ]
-    )
-    assert least < found <= most
-    for unknown in (
-        statistics.anees(np.array([1.0, INF]), 2),
-        statistics.anees(np.array([9.0, 9.0]), math.nan),
-    ):
-        assert unknown.verdict == "", (
-            "not of survivors, and without degrees of freedom there is no band"
-        )
-    assert math.isnan(statistics.anees(np.array([1.0, INF]), 2).mean)
+    squares = scale * np.random.default_rng(6).chisquare(2, (400, 15)) / 2
+    verdicts = [statistics.anees(row, 2).verdict for row in squares]
+    assert least < verdicts.count(verdict) / 400 <= most
+
+
+@pytest.mark.parametrize(("last", "dof"), [(INF, 2), (9.0, math.nan)])
+def test_anees_is_not_of_survivors_and_has_no_band_without_its_freedom(last, dof):
+    found = statistics.anees(np.array([9.0, last]), dof)
+    assert found.verdict == ""
+    assert math.isnan(found.mean) == math.isinf(last)
 
 
 KINDS = ("distinct", "ties", "zeros", "infinite", "mostly zeros", "one size")
@@ -231,15 +214,3 @@ def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
     assert statistics.signed_rank_p(np.zeros(8)) == 1.0
     assert math.isnan(statistics.signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
     assert statistics.signed_rank_p(np.arange(1.0, 7.0)) == 2.0**-5
-
-
-@given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_failure_rate_solves_wilsons_equation(counts):
-    failed, runs = counts
-    rate = statistics.failure_rate(failed, runs)
-    z = stats.norm.ppf(0.975)
-    for bound in (rate.low, rate.high):
-        assert (rate.share - bound) ** 2 == pytest.approx(
-            z**2 * bound * (1 - bound) / runs, abs=1e-9
-        )
-    assert 0 <= rate.low <= rate.share <= rate.high <= 1

@@ -1,22 +1,17 @@
 """Settings, topics, calibrations and rates as a user writes them."""
 
-from typing import Annotated
-
 import pytest
-import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
-from typer.testing import CliRunner
 
 from sonar_graph.cli import arguments
 from sonar_graph.cli.arguments import (
     ReadingOptions,
     estimator_settings,
     parse_settings,
-    with_options,
 )
 
 
@@ -57,25 +52,6 @@ def test_settings_go_to_their_estimator_at_any_depth():
 def test_topics_go_to_their_roles():
     options = ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"])
     assert options.choices == {"imu": "/imu/data", "dvl": "/a=b"}
-
-
-def test_fields_of_a_group_are_options():
-    given: list[object] = []
-
-    @with_options("end", "salvage")
-    def command(
-        name: Annotated[str, typer.Argument()], reading: ReadingOptions, times: int = 2
-    ) -> None:
-        given.extend([name, reading, times])
-
-    app = typer.Typer()
-    app.command()(command)
-    assert (
-        CliRunner().invoke(app, ["a", "--start", "3", "--topic", "imu=/b"]).exit_code
-        == 0
-    )
-    assert given == ["a", ReadingOptions(topics=["imu=/b"], start="3"), 2]
-    assert CliRunner().invoke(app, ["a", "--salvage"]).exit_code == 2
 
 
 def test_nothing_that_a_terminal_obeys_is_printed(capsys):

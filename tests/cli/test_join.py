@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from sonar_graph.calibration import (
     Calibration,
@@ -24,6 +22,7 @@ from sonar_graph.logs import (
     write_log,
 )
 from sonar_graph.logs.mcap import recording
+from tests.logs.converters import copies
 from tests.logs.converters.sonar_recordings import Aris, images
 from tests.recognition.imaged_lane import TOPIC, Lane
 
@@ -84,29 +83,7 @@ def bare(lane, tmp_path_factory) -> Path:
     """Navigation as another program writes it: mountings in ``/tf_static``, and no record of this package."""
     folder = tmp_path_factory.mktemp("bare")
     write_log(folder / "whole.mcap", lane.sequence)
-    with (
-        (folder / "whole.mcap").open("rb") as stream,
-        (folder / "nav.mcap").open("wb") as out,
-    ):
-        writer = Writer(out)
-        channels = {}
-        writer.start()
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.topic not in channels:
-                number = writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-                channels[channel.topic] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.topic],
-                message.log_time,
-                message.data,
-                message.publish_time,
-            )
-        writer.finish()
-    return folder / "nav.mcap"
+    return copies.bare(folder / "whole.mcap", folder / "nav.mcap")
 
 
 def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(

@@ -120,6 +120,7 @@ MISTAKES = {
     "convert dataset mrclam empty --number 1 -o new.mcap": "empty",
     "convert dataset dlr empty --number 1 -o new.mcap": "data set dlr: expected FOLDER",
     "report empty": "empty",
+    "calibration": "give --template",
     "report killed": "before any of its runs was done; give the bench command that began it again",
     "bench logs.toml -o out": r"logs\.toml, line 3: logs",
     "bench late.toml -o out": r"late\.toml, line 7: est",

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sonar_graph.devices import aris_azimuths, didson_azimuths, even_azimuths
+from sonar_graph.devices import aris_azimuths, didson_azimuths
 
 
 @pytest.mark.parametrize(
@@ -43,18 +43,4 @@ def test_didson_beams_solve_the_published_polynomial(beams, polynomial) -> None:
     to_right_deg = -np.degrees(didson_azimuths(beams))
     np.testing.assert_allclose(
         polynomial(to_right_deg), beams - np.arange(beams), atol=1e-4
-    )
-
-
-def test_the_first_beam_is_the_right_most() -> None:
-    for azimuths_rad in (
-        didson_azimuths(96),
-        aris_azimuths(128, telephoto=False),
-        even_azimuths(48, 14.0),
-    ):
-        assert azimuths_rad is not None
-        assert azimuths_rad[0] < 0 < azimuths_rad[-1]
-        assert np.all(np.diff(azimuths_rad) > 0)
-    np.testing.assert_allclose(
-        np.degrees(even_azimuths(4, 14.0)), [-10.5, -3.5, 3.5, 10.5]
     )

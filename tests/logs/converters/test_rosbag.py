@@ -24,6 +24,8 @@ from sonar_graph.logs.convert import convert_rosbag, rosbag
 from sonar_graph.logs.convert.rosbag import limited_bz2, limited_lz4, limited_zstd
 from sonar_graph.testing import small_world
 
+from .copies import bare
+
 T0_NS = 1_447_550_804_242_631_687
 STEP_NS = 20_000_001
 
@@ -184,18 +186,14 @@ def test_input_beyond_the_limit_of_unpacking_is_refused(
 
 
 @pytest.mark.parametrize(
-    "unpack",
+    ("pack", "unpack"),
     [
-        limited_bz2,
-        limited_lz4,
+        (bz2.compress, limited_bz2),
+        (lz4.frame.compress, limited_lz4),
+        (zstandard.compress, limited_zstd),
     ],
 )
-def test_a_chunk_that_is_cut_off_is_no_chunk(unpack):
-    pack = {
-        limited_bz2: bz2.compress,
-        limited_lz4: lz4.frame.compress,
-        limited_zstd: zstandard.compress,
-    }[unpack]
+def test_a_chunk_that_is_cut_off_is_no_chunk(pack, unpack):
     content = np.random.default_rng(0).bytes(300_000)
     packed = pack(content)
     assert unpack(packed) == content
@@ -459,27 +457,11 @@ def test_messages_that_are_compressed_one_by_one_are_read_as_they_are(
     write_log(tmp_path / "dive.mcap", small_world())
     pack = zstandard.ZstdCompressor().compress
     stream_pack = zstandard.ZstdCompressor(write_content_size=False).compress
-    with (
-        (tmp_path / "dive.mcap").open("rb") as source,
-        (tmp_path / "packed.mcap").open("wb") as target,
-    ):
-        reader = make_reader(source)
-        writer = McapWriter(target)
-        writer.start("ros2", "test")
-        channels: dict[int, int] = {}
-        for row, (schema, channel, message) in enumerate(reader.iter_messages()):
-            if channel.id not in channels:
-                number = writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, "cdr", number, channel.metadata
-                )
-            payload = (stream_pack if row % 7 == 3 else pack)(message.data)
-            writer.add_message(
-                channels[channel.id], message.log_time, payload, message.publish_time
-            )
-        writer.finish()
+
+    def packed_payload(row: int, payload: bytes) -> bytes:
+        return (stream_pack if row % 7 == 3 else pack)(payload)
+
+    bare(tmp_path / "dive.mcap", tmp_path / "packed.mcap", packed_payload)
     packed = read_log(tmp_path / "packed.mcap")
     plain = read_log(tmp_path / "dive.mcap")
     for role in ("imu", "dvl", "depth", "truth"):
