@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
 
 from sonar_graph.logs import read_log, read_sonar_frames, write_log
 from sonar_graph.simulation import (
@@ -37,30 +35,19 @@ def test_images_and_sensors_are_those_of_the_library(run, tmp_path, capsys):
     assert laid in capsys.readouterr().out
     options = BasinOptions.model_validate(SHORT)
     read = list(read_sonar_frames(tmp_path / "a.mcap"))
-    made = list(simulate_basin_frames(options))
-    order = np.argsort([block.stamps_ns[0] for block in read])
-    images = np.concatenate([read[k].intensity for k in order])
+    made = [block.frames for block in simulate_basin_frames(options)]
+    for images in (read, made):
+        images.sort(key=lambda block: block.stamps_ns[0])
     np.testing.assert_array_equal(
-        images, np.concatenate([block.frames.intensity for block in made])
+        *(np.concatenate([one.intensity for one in blocks]) for blocks in (read, made))
     )
-    np.testing.assert_allclose(
-        read[0].azimuths_rad, made[0].frames.azimuths_rad, atol=1e-12
-    )
+    angles = made[0].azimuths_rad
+    np.testing.assert_allclose(read[0].azimuths_rad, angles, atol=1e-12)
     sequence = read_log(tmp_path / "a.mcap")
-    expected = simulate_basin(options)
+    rates = simulate_basin(options).imu.angular_velocity
+    np.testing.assert_array_equal(sequence.imu.angular_velocity, rates)
     assert sequence.detections is None
-    np.testing.assert_array_equal(
-        sequence.imu.angular_velocity, expected.imu.angular_velocity
-    )
     assert sequence.true_landmarks is not None
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        times_ns = [
-            record.log_time
-            for record in StreamReader(stream).records
-            if isinstance(record, Message)
-        ]
-    assert len(times_ns) > 60
-    assert times_ns == sorted(times_ns)
 
 
 @pytest.fixture(scope="module")

@@ -103,10 +103,16 @@ def folder(tmp_path):
     return folder
 
 
-def plain(folder: Path, d: SimpleNamespace, *names: str, scale: float = 1.0) -> None:
+def plain(
+    folder: Path,
+    d: SimpleNamespace,
+    *names: str,
+    scale: float = 1.0,
+    start_s: float = 0.0,
+) -> None:
     """The tables of a dive that a test does not write in its own way."""
     k = d.slow
-    t = np.round(d.s * scale, 9)
+    t = np.round((start_s + d.s) * scale, 9)
     if "imu" in names:
         header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
         write(folder / "imu.csv", header, t, *d.rate.T, *d.force.T)
@@ -165,28 +171,21 @@ def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool):
 def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
     d = dive(imu_hz=10.0, every=1)
     stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@")
-    header = "Timestamp,roll,pitch,heading,rollRate,pitchRate,yawRate,groundSpeed,altitudeRelative,battery0.id"
+    header = "Timestamp,heading,rollRate,pitchRate,yawRate,groundSpeed,battery0.id"
     flat = np.zeros(ROWS)
-    columns = (*d.rate.T, *np.degrees(d.rate).T, flat, -d.depth, flat)
-    columns = (columns[0], columns[1], d.bearing, *columns[3:])
+    columns = d.bearing, *np.degrees(d.rate).T, flat, flat
     write(folder / "vehicle.csv", header, stamps, *columns)
-    seconds = EPOCH_S + d.s
-    write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", seconds, *d.velocity.T)
+    plain(folder, d, "dvl", start_s=EPOCH_S)
     text, config = template(folder)
-    assert "imu" not in config
-    assert "# [imu]  # no accelerometer: is this the IMU?" in text
-    assert config["heading"]["scale"] == "deg"
     # the battery has an identity
-    assert "true_landmarks" not in config
+    assert config.keys() == {"dvl", "heading"}
+    assert config["heading"]["scale"] == "deg"
+    assert "# [imu]  # no accelerometer: is this the IMU?" in text
     with pytest.raises(LogError, match=r"has no table \[imu\]"):
         guessed(folder, tmp_path)
-    taken = uncommented(text, "imu").replace(
-        'angular_velocity_scale = "deg/s"', 'angular_velocity_scale = "deg/s"\n'
-    )
-    taken = taken.replace(
-        '# angular_velocity_scale = "deg/s"', 'angular_velocity_scale = "deg/s"'
-    )
-    sequence = guessed(folder, tmp_path, taken)
+    unit = 'angular_velocity_scale = "deg/s"'
+    taken = uncommented(text, "imu").replace(f"# {unit}", unit)
+    sequence = guessed(folder, tmp_path, taken.replace(unit, f"{unit}\n"))
     np.testing.assert_allclose(sequence.imu.angular_velocity, d.rate, atol=1e-9)
     assert np.isnan(sequence.imu.specific_force).all()
     expected = np.unwrap(np.radians(90 - d.bearing))
