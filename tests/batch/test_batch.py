@@ -35,15 +35,12 @@ from sonar_graph.files import (
     noticed_interrupts,
     terminations_as_interrupts,
 )
+from tests.dying import Died
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 LIMITS = Limits(600.0)
 HERE = Where(1)
-
-
-class Killed(BaseException):
-    """Ends a process as SIGKILL does, without a message."""
 
 
 def nobody(_run: PlannedRun, _outcome: RunOutcome) -> None:
@@ -247,10 +244,10 @@ def kill(
         for run in runs[:count]:
             do_here([run], store)
             progress(run, RunOutcome({"status": "ok"}))
-        raise Killed
+        raise Died
 
     monkeypatch.setattr(cluster, "run_batch", killed)
-    with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Killed):
+    with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Died):
         batch.run(HERE, LIMITS, nobody)
 
 

@@ -1,5 +1,6 @@
 """Runs are kept whole or not at all, and nothing else is removed with them."""
 
+import contextlib
 import errno
 import os
 from pathlib import Path
@@ -9,16 +10,13 @@ import pytest
 
 from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.errors import BatchError
+from tests.dying import Died, dies_after
 
 OUTCOME = RunOutcome(
     {"status": "ok", "causal.ate_raw_m": 0.1},
     {"runs/isam2/series.npz": b"123", "a.json": b"{}"},
     "said",
 )
-
-
-class Died(BaseException):
-    """Ends a process."""
 
 
 def names(folder: Path) -> list[str]:
@@ -74,45 +72,23 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
     assert not list((tmp_path / "runs").glob(".*"))
 
 
-def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch):
-    store = Store(tmp_path)
-
-    def die(_self: Path, _target: Path) -> None:
-        raise Died
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", die)
-        # a killed process cleans nothing up
-        patch.setattr("sonar_graph.batch.store.remove_written", lambda _: None)
-        with pytest.raises(Died):
-            store.write("k", OUTCOME)
-    assert store.row("k") is None
-    assert list((tmp_path / "runs").iterdir())
-    store.remove_partial()
-    assert not list((tmp_path / "runs").iterdir())
-
-
 @pytest.mark.parametrize("act", ["discard", "write"])
-def test_a_process_killed_during_removal_leaves_a_run_whole_or_gone(
-    tmp_path, monkeypatch, act
+@pytest.mark.parametrize("steps", range(40))
+def test_a_process_that_dies_leaves_a_run_whole_or_gone(
+    tmp_path, monkeypatch, act, steps
 ):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
-    whole = names(store.run_folder("k"))
-
-    def die(folder: Path, **_options: Any) -> None:
-        next(path for path in folder.rglob("*.npz")).unlink()
-        raise Died
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sonar_graph.batch.store.remove_written", die)
-        with pytest.raises(Died):
-            store.discard("k") if act == "discard" else store.write("k", OUTCOME)
-    assert (store.row("k") is None) == (not store.run_folder("k").exists())
-    assert not store.run_folder("k").exists() or names(store.run_folder("k")) == whole
+    whole = names(tmp_path)
+    with monkeypatch.context() as patch, contextlib.suppress(Died):
+        dies_after(steps, patch)
+        store.discard("k") if act == "discard" else store.write("k", OUTCOME)
+    is_whole = store.run_folder("k").exists()
+    assert store.row("k") == (OUTCOME.row if is_whole else None)
     store.remove_partial()
+    assert names(tmp_path) == (whole if is_whole else [])
     store.write("k", OUTCOME)
-    assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
+    assert names(tmp_path) == whole
 
 
 def test_a_lost_or_foreign_row_counts_as_not_done(

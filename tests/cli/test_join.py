@@ -94,15 +94,11 @@ def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
     assert expected != Mounting()
     assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
     joined = read_log(out)
-    np.testing.assert_allclose(
-        joined.calibration.sonar.mounting.translation_m,
-        expected.translation_m,
-        atol=1e-12,
-    )
-    np.testing.assert_allclose(
-        joined.calibration.sonar.mounting.rpy_rad, expected.rpy_rad, atol=1e-12
-    )
-    assert joined.calibration.sonar.image.decibel_span == 75.0
+    sonar = joined.calibration.sonar
+    for name in ("translation_m", "rpy_rad"):
+        found = getattr(sonar.mounting, name)
+        assert found == pytest.approx(getattr(expected, name), abs=1e-12)
+    assert sonar.image.decibel_span == 75.0
     assert "not stated" in joined.notes["log.start"]
 
 
@@ -115,28 +111,15 @@ def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
         "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
         "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
     )
+    words = "-o", out, "--offset", OFFSET_S, "--calibration", given
     for navigation in (bare, both[1]):
-        assert (
-            run(
-                "join",
-                both[0],
-                navigation,
-                "-o",
-                out,
-                "--offset",
-                OFFSET_S,
-                "--calibration",
-                given,
-            )
-            == 0
-        )
+        assert run("join", both[0], navigation, *words) == 0
         found = read_log(out).calibration
         assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
         assert found.start.position_m == (1.0, 2.0, -0.5)
         assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
-        assert found.dvl.mounting.rpy_rad == pytest.approx(
-            read_log(navigation).calibration.dvl.mounting.rpy_rad
-        )
+        dvl = read_log(navigation).calibration.dvl
+        assert found.dvl.mounting.rpy_rad == pytest.approx(dvl.mounting.rpy_rad)
 
 
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
