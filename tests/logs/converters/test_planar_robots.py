@@ -124,46 +124,24 @@ T0 = 1248444187
 NS = 10**9
 
 
-@pytest.fixture
-def folder(tmp_path):
-    def write(name, rows):
-        (tmp_path / name).write_text(
-            "# Data Format:\n"
-            + "".join(" \t ".join(map(str, row)) + "\n" for row in rows)
-        )
-
-    write("Barcodes.dat", [(1, 5), (2, 14), (6, 63), (20, 25)])
-    write(
-        "Landmark_Groundtruth.dat",
-        [(20, 1.5, -2.5, 0.001, 0.002), (6, 3.0, 4.0, 0.003, 0.004)],
-    )
-    write(
-        "Robot1_Odometry.dat",
-        [(f"{T0}.100", 0.1, 0.0), (f"{T0}.300", 0.2, 0.5), (f"{T0}.400", 0.0, 0.0)],
-    )
-    write(
-        "Robot1_Groundtruth.dat",
-        [(f"{T0}.000", 1, 2, 3.0), (f"{T0}.200", 3, 2, -3.0), (f"{T0}.200", 9, 9, 0)],
-    )
-    seen = [
-        (".250", 25, 2.0, 0.1),
-        (".250", 14, 2.0, 0.1),
-        (".120", 63, 1.0, -0.2),
-        (".350", 99, 1, 0),
-    ]
-    write("Robot1_Measurement.dat", [(f"{T0}{time}", *row) for time, *row in seen])
-    return tmp_path
-
-
-def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder):
-    (folder / "Robot1_Groundtruth.dat").write_text(f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n")
+RUN = {
+    "Barcodes.dat": "1 \t 5\n2 \t 14\n6 \t 63\n20 \t 25\n",
+    "Landmark_Groundtruth.dat": "20 1.5 -2.5 0.001 0.002\n6 3.0 4.0 0.003 0.004\n",
+    "Robot1_Odometry.dat": f"{T0}.100 0.1 0.0\n{T0}.300 0.2 0.5\n{T0}.400 0.0 0.0\n",
+    "Robot1_Groundtruth.dat": f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n",
     # of another robot
-    (folder / "Robot1_Measurement.dat").write_text(f"{T0}.2 14 1 0\n")
-    late = read_mrclam(folder, 1)
+    "Robot1_Measurement.dat": f"{T0}.2 14 1 0\n",
+}
+
+
+def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(tmp_path):
+    for name, text in RUN.items():
+        (tmp_path / name).write_text(f"# Data Format:\n{text}")
+    late = read_mrclam(tmp_path, 1)
     assert (len(late.truth), late.detections) == (2, None)
     assert "origin" in late.notes["start"]
-    (folder / "Robot1_Groundtruth.dat").unlink()
-    never = read_mrclam(folder, 1)
+    (tmp_path / "Robot1_Groundtruth.dat").unlink()
+    never = read_mrclam(tmp_path, 1)
     assert never.truth is None
     assert never.true_landmarks is not None
     assert "no robot truth" in never.notes["truth"]
