@@ -217,14 +217,11 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
         When there are no results, no run was done yet, the table lacks a column, or the reference is not planned.
     """
     path = folder / RESULTS
-    if not path.is_file() and is_batch(folder):
-        raise EvaluationError(
-            f"{folder}: no {RESULTS} in it: the batch was ended before any of its runs was done; {GOING_ON}"
-        )
     if not path.is_file():
-        raise EvaluationError(
-            f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to"
-        )
+        why = "; it needs a folder that bench wrote to"
+        if is_batch(folder):
+            why = f": the batch was ended before any of its runs was done; {GOING_ON}"
+        raise EvaluationError(f"{folder}: no {RESULTS} in it{why}")
     try:
         # loaded here, because a comparison needs no extra
         import pyarrow as pa  # of the extra `bench`

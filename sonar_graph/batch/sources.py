@@ -18,7 +18,7 @@ from pydantic import Field
 from sonar_graph.calibration import Section
 from sonar_graph.diagnosis import compared, trusted
 from sonar_graph.files import regular
-from sonar_graph.logs import read_log
+from sonar_graph.logs import PartialCalibration, read_log
 from sonar_graph.logs.adapters import as_log_config
 from sonar_graph.logs.convert import (
     read_akit,
@@ -28,7 +28,6 @@ from sonar_graph.logs.convert import (
     read_victoria_park,
 )
 from sonar_graph.logs.mcap import LogFile, TimeWindow, log_parts
-from sonar_graph.logs.vehicle_setup import as_calibration
 from sonar_graph.map_file import in_map, read_map
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
@@ -111,7 +110,8 @@ def _check_log(options: LogOptions) -> None:
     """Raise for a file that is no log, and for options about it that cannot be understood."""
     for part in log_parts(Path(options.log)):
         LogFile(part).close()
-    as_calibration(options.calibration, "read_log")
+    if options.calibration is not None:
+        PartialCalibration.read(Path(options.calibration))
     as_log_config(options.log_config, "read_log")
     TimeWindow.parse(options.start, options.end)
     if options.map is not None:

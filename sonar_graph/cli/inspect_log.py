@@ -190,9 +190,12 @@ def print_summary(
             "not shown",
             f"{len(summary.topics) - len(shown)} more topics; --json gives all",
         )
-    about = {"calibration": summary.calibration, **summary.notes}
-    about |= {"sonar images": summary.sonar, "sensors": skipped}
-    for subject, note in about.items():
+    about = [("calibration", summary.calibration), *summary.notes.items()]
+    for subject, note in [
+        *about,
+        ("sonar images", summary.sonar),
+        ("sensors", skipped),
+    ]:
         if note:
             say(subject, note)
     if not skipped:

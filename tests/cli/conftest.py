@@ -40,16 +40,8 @@ def basin(basin_content, tmp_path) -> Path:
     return log
 
 
-@pytest.fixture(scope="session")
-def dive_content(tmp_path_factory) -> bytes:
-    log = tmp_path_factory.mktemp("log") / "dive.mcap"
-    write_log(log, small_world())
-    return log.read_bytes()
-
-
 @pytest.fixture
-def dive(dive_content, tmp_path) -> Path:
+def dive(tmp_path) -> Path:
     """A log of 20 s, for commands that would do the same with any."""
-    log = tmp_path / "dive.mcap"
-    log.write_bytes(dive_content)
-    return log
+    write_log(tmp_path / "dive.mcap", small_world())
+    return tmp_path / "dive.mcap"

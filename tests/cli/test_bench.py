@@ -2,7 +2,6 @@
 
 import sys
 
-import sonar_graph
 from sonar_graph.cli.arguments import printable
 from sonar_graph.cli.bench import MOST_REASONS, reasons_told
 from tests.recorded_batches import drawn_batch, failed, written_batch
@@ -12,10 +11,6 @@ def test_missing_packages_are_named_with_how_to_get_them(
     run, tmp_path, capsys, monkeypatch
 ):
     (tmp_path / "suite.toml").touch()
-    for name in [name for name in sys.modules if name.startswith("sonar_graph.batch")]:
-        monkeypatch.delitem(sys.modules, name)
-    # back to the modules that are known by now
-    monkeypatch.setattr(sonar_graph, "batch", sonar_graph.batch)
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert run("bench", tmp_path / "suite.toml", "-o", tmp_path / "out") == 2
     assert "pip install 'sonar-graph[bench]'" in capsys.readouterr().err

@@ -86,25 +86,11 @@ def test_every_command_and_group_has_help_that_ends_in_examples(run, path, capsy
 
 def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
-    for name in (
-        *files.split(),
-        "imu.csv",
-        "dvl.csv",
-        "dive_sonar.mcap",
-        "labels.json",
-    ):
+    files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw suite.toml imu.csv dvl.csv"
+    folders = "comparison MRCLAM_Dataset6 A-KIT StPereDataset ros2_bag_folder folder_of_tables"
+    for name in (*files.split(), "dive_sonar.mcap", "labels.json"):
         Path(name).touch()
-    for name in (
-        "comparison",
-        "MRCLAM_Dataset6",
-        "DLR",
-        "A-KIT",
-        "StPereDataset",
-        "ros2_bag_folder",
-        "results",
-        "folder_of_tables",
-    ):
+    for name in folders.split():
         Path(name).mkdir()
     for path, command in commands().items():
         lines = [line.partition(" > ")[0] for line in command.epilog.splitlines()]

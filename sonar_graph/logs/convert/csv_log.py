@@ -87,7 +87,7 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
             raise LogError(
                 f"{source}: there is no role [{role}]; {hint}tables are for {', '.join(CSV_ADAPTERS)}"
             )
-    found = {role: _role(role, shared | tables[role], source) for role in tables}
+    found = {role: _role(role, shared | dict(tables[role]), source) for role in tables}
     for role in ("imu", "dvl"):
         if role not in found:
             raise LogError(

@@ -152,7 +152,7 @@ def planar_calibration(
     )
 
 
-class Sighting(NamedTuple):
+class StepSighting(NamedTuple):
     """A landmark in the frame of a pose, and its equally probable identities; negative ones are left out."""
 
     pose: int
@@ -165,7 +165,7 @@ class Sighting(NamedTuple):
 def sequence_of_steps(
     name: str,
     steps: list[list[float]],
-    seen: list[Sighting],
+    seen: list[StepSighting],
     step_cov_places: list[list[int]],
     body_R_file: Floats,
     notes: Mapping[str, str],
@@ -208,7 +208,7 @@ def sequence_of_steps(
 
 
 def _detections(
-    seen: list[Sighting], stamps_ns: Ints, plane: Floats
+    seen: list[StepSighting], stamps_ns: Ints, plane: Floats
 ) -> LandmarkDetections:
     """Landmarks as ranges and azimuths, at the end of the step before; ``plane`` turns the file's axes to the body's."""
     most = max(len(one.ids) for one in seen)
@@ -252,7 +252,7 @@ def read_dlr(path: Path) -> Sequence:
             )
         path = path / DLR_FILE
     steps: list[list[float]] = []
-    seen: list[Sighting] = []
+    seen: list[StepSighting] = []
     for place, kind, rest in _lines(path, DLR_LINES, "STEP", "LANDMARK", "LANDMARK_C"):
         if kind == "STEP":
             # the first number is that of an image
@@ -268,7 +268,7 @@ def read_dlr(path: Path) -> Sequence:
             raise DatasetError(
                 f"{place}: {ids} are no landmark IDs; expected whole numbers after the covariances"
             )
-        seen.append(Sighting(len(steps), [x, y, *cov], list(map(int, ids))))
+        seen.append(StepSighting(len(steps), [x, y, *cov], list(map(int, ids))))
     if not steps:
         raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
     without = sum(one.ids == [-1] for one in seen)
@@ -316,7 +316,7 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     """
     path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
     steps: list[list[float]] = []
-    seen: list[Sighting] = []
+    seen: list[StepSighting] = []
     newest = 0
     for place, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
         start, end, *values = _numbers(place, rest, PARK_COLUMNS[kind])
@@ -330,7 +330,7 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
             newest = int(end)
             steps.append(values)
         else:
-            seen.append(Sighting(len(steps), values, [int(end)]))
+            seen.append(StepSighting(len(steps), values, [int(end)]))
     if not steps:
         raise DatasetError(f"{path}: holds no ODOMETRY line; expected {PARK_LINES}")
     return sequence_of_steps(

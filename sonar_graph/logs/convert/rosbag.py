@@ -431,5 +431,5 @@ def _recoder(own: str, bag: AnyReader | Ros1InMcap, store: Typestore) -> Recode:
     if is_same_wireformat(bag.typestore, store, own, type_name):
         # CDR of the same fields needs no change
         return memoryview if bag.is2 else partial(store.ros1_to_cdr, typename=type_name)
-    types = bag.typestore, store, own, type_name, {}
-    return partial(migrate_bytes, *types, src_is2=bag.is2, dst_is2=True)
+    kinds = bag.typestore, store, own, type_name
+    return partial(migrate_bytes, *kinds, {}, src_is2=bag.is2, dst_is2=True)
