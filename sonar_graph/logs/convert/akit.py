@@ -6,6 +6,7 @@ down and a world of north, east, down. ``docs/theory/datasets.md`` derives from 
 the sign of the IMU's y axis, the times of the rows, the lever arms, and that the gyros measure the Earth's rotation.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,12 +149,9 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     positions = east_north_up(latitude, longitude, altitude, origin)
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)
     offset_s = reference_offset_s(imu, truth)
-    shifted_ns = reference_ns + round(offset_s * NS_PER_S)
+    truth = replace(truth, stamps_ns=reference_ns + round(offset_s * NS_PER_S))
     # before the IMU's first row there is nothing to compare
-    is_kept = shifted_ns >= 0
-    truth = Trajectory.without_covariances(
-        shifted_ns[is_kept], positions[is_kept], quaternions[is_kept]
-    )
+    truth = truth.rows(np.flatnonzero(truth.stamps_ns >= 0))
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:
         raise DatasetError(

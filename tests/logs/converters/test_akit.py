@@ -107,7 +107,7 @@ class TestRecording:
 
 
 def sideways_error(sequence, lever, dvl_delay_s=0.0):
-    """Standard deviation of the DVL's leftward velocity error, with the reference's delay taken out."""
+    """Standard deviation of the DVL's leftward velocity error."""
     knots = sequence.truth.stamps_ns * 1e-9
     position = CubicSpline(knots, sequence.truth.positions)
     attitude = Slerp(knots, sequence.truth.rotations())
@@ -117,24 +117,6 @@ def sideways_error(sequence, lever, dvl_delay_s=0.0):
     rate = np.mean(
         [sequence.imu.angular_velocity[centre + k] for k in range(-10, 11)], axis=0
     )
-    delay = reference_delay(sequence)
-    body_R_world = attitude(seconds + delay).inv()
-    expected = body_R_world.apply(position(seconds + delay, 1)) + np.cross(rate, lever)
+    body_R_world = attitude(seconds).inv()
+    expected = body_R_world.apply(position(seconds, 1)) + np.cross(rate, lever)
     return np.std(sequence.dvl.velocity[rows, 1] - expected[:, 1])
-
-
-def reference_delay(sequence):
-    """Seconds by which the reference's heading rate comes after the gyro's."""
-    knots = sequence.truth.stamps_ns * 1e-9
-    heading = CubicSpline(
-        knots, np.unwrap(sequence.truth.rotations().as_euler("ZYX")[:, 0])
-    )
-    smooth = np.convolve(
-        sequence.imu.angular_velocity[:, 2], np.ones(100) / 100, "same"
-    )
-    seconds = np.arange(5, 390)
-    errors = [
-        (np.std(heading(seconds + d, 1) - smooth[seconds * 100]), d)
-        for d in np.arange(-0.7, 0.71, 0.02)
-    ]
-    return min(errors)[1]

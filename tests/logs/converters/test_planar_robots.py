@@ -196,45 +196,31 @@ def wrapped(angle):
 
 STEP = f"STEP image 0 0 0 {COV} 1e-4\n"
 EDGE = "ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n"
-IMU, DVL, GT = (f"Trajectory2/{kind}_trajectory2.csv" for kind in ("IMU", "DVL", "GT"))
-AKIT = {
-    IMU: "h\n0,1,2,3,4,5,6\n",
+DVL, GT = (f"Trajectory2/{kind}_trajectory2.csv" for kind in ("DVL", "GT"))
+FILES = {
+    "bad.dat": "1 2\n",
+    "map.circles": STEP,
+    "park.txt": EDGE,
+    "Trajectory2/IMU_trajectory2.csv": "h\n0,1,2,3,4,5,6\n",
     DVL: "h\n0,1,2,3\n",
     GT: "h\n" + "0,1,0.5,0,0,0,0,0,0,0\n" * 3,
-}
-ODOMETRY, SEEN, BARCODES, MARKS = (
-    f"{name}.dat"
-    for name in (
-        "Robot1_Odometry",
-        "Robot1_Measurement",
-        "Barcodes",
-        "Landmark_Groundtruth",
-    )
-)
-MRCLAM = {
-    ODOMETRY: "1 0 0\n",
+    "Robot1_Odometry.dat": "1 0 0\n",
     "Robot3_Odometry.dat": "1 0 0\n",
-    SEEN: "1 63 1 0\n",
-    BARCODES: "6 63\n",
+    "Robot1_Measurement.dat": "1 63 1 0\n",
+    "Barcodes.dat": "6 63\n",
+    "Landmark_Groundtruth.dat": "6 1 1 0 0\n",
 }
-MRCLAM |= {MARKS: "6 1 1 0 0\n"}
 READERS = {
-    "table": (
-        lambda folder: read_table(folder / "bad.dat", ("time", "value")),
-        {"bad.dat": "1 2\n"},
-    ),
-    "dlr": (lambda folder: read_dlr(folder / "map.circles"), {"map.circles": STEP}),
-    "dlr folder": (read_dlr, {}),
-    "park": (
-        lambda folder: read_victoria_park(folder / "park.txt"),
-        {"park.txt": EDGE},
-    ),
-    "akit": (lambda folder: read_akit(folder, 2), AKIT),
-    "akit 5": (lambda folder: read_akit(folder, 5), AKIT),
-    "akit inside": (lambda folder: read_akit(folder / "Trajectory2", 2), AKIT),
-    "mrclam": (lambda folder: read_mrclam(folder, 1), MRCLAM),
-    "mrclam 7": (lambda folder: read_mrclam(folder, 7), MRCLAM),
-    "mrclam absent": (lambda folder: read_mrclam(folder / "absent", 1), MRCLAM),
+    "table": lambda folder: read_table(folder / "bad.dat", ("time", "value")),
+    "dlr": lambda folder: read_dlr(folder / "map.circles"),
+    "dlr folder": read_dlr,
+    "park": lambda folder: read_victoria_park(folder / "park.txt"),
+    "akit": lambda folder: read_akit(folder, 2),
+    "akit 5": lambda folder: read_akit(folder, 5),
+    "akit inside": lambda folder: read_akit(folder / "Trajectory2", 2),
+    "mrclam": lambda folder: read_mrclam(folder, 1),
+    "mrclam 7": lambda folder: read_mrclam(folder, 7),
+    "mrclam absent": lambda folder: read_mrclam(folder / "absent", 1),
 }
 
 
@@ -270,7 +256,7 @@ READERS = {
         ("dlr", {"map.circles": STEP + "CIRCLE 1"}, ("line 2", "CIRCLE")),
         (
             "dlr folder",
-            {},
+            {"map.circles": None},
             ("map.circles", "STEP", "give the folder that does, or the file itself"),
         ),
         ("park", {"park.txt": ""}, ("park.txt", "holds no ODOMETRY line")),
@@ -294,10 +280,13 @@ READERS = {
         ("akit inside", {}, ("no such run", "holds TrajectoryN")),
         (
             "mrclam",
-            {ODOMETRY: "1 0.1 0\n2 0.1\n"},
+            {"Robot1_Odometry.dat": "1 0.1 0\n2 0.1\n"},
             ("Robot1_Odometry.dat, line 2", "angular velocity"),
         ),
-        *(("mrclam", {name: None}, (name,)) for name in (SEEN, BARCODES, MARKS)),
+        *(
+            ("mrclam", {name: None}, (name,))
+            for name in ("Barcodes.dat", "Robot1_Measurement.dat")
+        ),
         (
             "mrclam 7",
             {},
@@ -309,18 +298,12 @@ READERS = {
 def test_a_bad_table_or_data_set_is_refused_by_file_and_line(
     tmp_path, reader, changed, fragments
 ):
-    read, files = READERS[reader]
-    write(tmp_path, files | changed)
-    with pytest.raises(DatasetError) as caught:
-        read(tmp_path)
-    assert "\n" not in str(caught.value)
-    assert [
-        fragment for fragment in fragments if fragment not in str(caught.value)
-    ] == []
-
-
-def write(folder, files):
-    for name, text in files.items():
+    for name, text in (FILES | changed).items():
         if text is not None:
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_bytes(text.encode("latin-1"))
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text(text)
+    with pytest.raises(DatasetError) as caught:
+        READERS[reader](tmp_path)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert [fragment for fragment in fragments if fragment not in said] == []
