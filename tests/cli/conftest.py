@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,3 +46,14 @@ def dive(tmp_path) -> Path:
     """A log of 20 s, for commands that would do the same with any."""
     write_log(tmp_path / "dive.mcap", small_world())
     return tmp_path / "dive.mcap"
+
+
+@pytest.fixture
+def reply(run, capsys) -> Callable[..., Any]:
+    """Gives what ``sonar-graph`` prints with these arguments, after its expected exit code."""
+
+    def answer(code: int, *arguments: object) -> Any:
+        assert run(*arguments) == code
+        return capsys.readouterr()
+
+    return answer

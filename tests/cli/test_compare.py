@@ -21,10 +21,9 @@ from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS
 
 
 def test_compare_writes_what_it_names_and_report_draws_it_again(
-    run, basin, tmp_path, capsys
+    run, basin, tmp_path, reply
 ):
-    assert run("compare", basin, "-o", tmp_path, "--rate-hz", "1") == 0
-    told = capsys.readouterr()
+    told = reply(0, "compare", basin, "-o", tmp_path, "--rate-hz", "1")
     page = tmp_path / "report.html"
     assert f"Report: {page}" in told.out.splitlines()
     assert told.err == ""
@@ -42,7 +41,7 @@ def test_compare_writes_what_it_names_and_report_draws_it_again(
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_names_that_are_not_utf_8_are_read_and_escaped(run, dive, tmp_path, capsys):
+def test_names_that_are_not_utf_8_are_read_and_escaped(run, dive, tmp_path, reply):
     odd = dive.rename(tmp_path / "odd\udcff.mcap")
     assert (
         run(
@@ -55,8 +54,7 @@ def test_names_that_are_not_utf_8_are_read_and_escaped(run, dive, tmp_path, caps
         )
         == 0
     )
-    assert run("report", tmp_path / "out\udcff") == 0
-    assert "out\\udcff/report.html" in capsys.readouterr().out
+    assert "out\\udcff/report.html" in reply(0, "report", tmp_path / "out\udcff").out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -88,7 +86,7 @@ def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(
 
 @pytest.mark.usefixtures("unrendered")
 def test_failed_run_is_written_and_reported_by_exit_code(
-    run, dive, tmp_path, monkeypatch, capsys
+    run, dive, tmp_path, monkeypatch, reply
 ):
     from baselines.dead_reckoning import DeadReckoning
 
@@ -97,10 +95,17 @@ def test_failed_run_is_written_and_reported_by_exit_code(
 
     monkeypatch.setattr(DeadReckoning, "process", fail)
     assert (
-        run("compare", dive, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam")
-        == 1
+        "the filter is tired"
+        in reply(
+            1,
+            "compare",
+            dive,
+            "-o",
+            tmp_path,
+            "--estimators",
+            "dead-reckoning,ekf-slam",
+        ).err
     )
-    assert "the filter is tired" in capsys.readouterr().err
     assert "the filter is tired" in (tmp_path / "report.html").read_text()
     runs = json.loads((tmp_path / "comparison.json").read_text())["runs"]
     assert {name: run["status"] for name, run in runs.items()} == {
@@ -127,7 +132,7 @@ def test_run_uses_the_given_calibration_field_by_field(run, dive, tmp_path):
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_run_and_compare_begin_with_grave_findings(run, basin, tmp_path, capsys):
+def test_run_and_compare_begin_with_grave_findings(run, basin, tmp_path, reply):
     """Before what follows from it: refused rows, and a map that is far off."""
     log = tmp_path / "spoilt.mcap"
     out = tmp_path / "out"
@@ -137,23 +142,21 @@ def test_run_and_compare_begin_with_grave_findings(run, basin, tmp_path, capsys)
     write_log(log, replace(sequence, imu=imu))
     told = []
     for command, option in (("run", "--estimator"), ("compare", "--estimators")):
-        assert run(command, log, option, "ekf-slam", "-o", out) == 3
-        told.append(capsys.readouterr().out)
+        told.append(reply(3, command, log, option, "ekf-slam", "-o", out).out)
     for text in (*told, (out / "report.html").read_text()):
         _, _, first = text.partition("Doubtful: ")
         assert first.startswith("gyro: unit: rates look 57 times too large")
 
 
-def test_estimators_lists_every_setting(run, capsys):
-    assert run("estimators") == 0
-    shown = capsys.readouterr().out
+def test_estimators_lists_every_setting(reply):
+    shown = reply(0, "estimators").out
     for name in ("isam2", "invariant-ekf", "ekf-slam", "dead-reckoning"):
         assert name in shown
         for setting in load_estimator(name).Params.model_fields:
             assert setting in shown
 
 
-def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys):
+def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys, reply):
     options = ("--estimator", "dead-reckoning", "--start", "30", "--end", "60")
     # the start that the log states is another
     assert run("run", basin, "-o", tmp_path / "out", *options) == 3
@@ -162,21 +165,19 @@ def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys):
     ]
     assert notes["log.part"] == "30.000 s to 60.000 s of the recording"
     capsys.readouterr()
-    assert run("inspect", basin, "--start", "30", "--end", "60") == 3
-    assert ", 30.0 s" in capsys.readouterr().out
+    assert ", 30.0 s" in reply(3, "inspect", basin, "--start", "30", "--end", "60").out
 
 
 def test_a_damaged_log_is_refused_with_the_option_that_reads_it(
-    run, basin, tmp_path, capsys
+    run, basin, tmp_path, reply
 ):
     log = tmp_path / "damaged.mcap"
     content = bytearray(basin.read_bytes())
     content[len(content) // 3] ^= 1
     log.write_bytes(content)
     options = ("-o", tmp_path / "out", "--estimator", "dead-reckoning")
-    assert run("run", log, *options) == 2
     assert re.search(
-        r"is damaged: bytes .* is lost: .*--salvage", capsys.readouterr().err
+        r"is damaged: bytes .* is lost: .*--salvage", reply(2, "run", log, *options).err
     )
     assert run("run", log, *options, "--salvage") == 0
     notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"][
@@ -186,12 +187,11 @@ def test_a_damaged_log_is_refused_with_the_option_that_reads_it(
 
 
 @pytest.mark.slow
-def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkeypatch):
+def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, monkeypatch, reply):
     monkeypatch.setattr(
         "sonar_graph.cli.compare.DEMO", DEMO | {"duration_s": 130.0, "laps": 1}
     )
-    assert run("demo", "-o", tmp_path) == 0
-    told = capsys.readouterr().out
+    told = reply(0, "demo", "-o", tmp_path).out
     assert f"Report: {tmp_path / 'report.html'}" in told
     assert "2014 paper" in (tmp_path / "report.html").read_text("utf-8")
     sequence = read_log(tmp_path / "basin.mcap")
@@ -220,7 +220,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
 @pytest.mark.slow
 @pytest.mark.recording
 def test_the_documented_commands_convert_inspect_and_reckon(
-    run, recordings, tmp_path, monkeypatch, capsys
+    run, recordings, tmp_path, monkeypatch, reply
 ):
     """A pool run with a Doppler log of unknown axes: the commands and the file of the page, and no code."""
     section = PAGE.read_text(encoding="utf-8").split("## SONIA")[1]
@@ -230,11 +230,11 @@ def test_the_documented_commands_convert_inspect_and_reckon(
         recordings / "bags" / "sonia_imu_dvl.bag"
     )
     monkeypatch.chdir(tmp_path)
-    printed = []
-    for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE):
-        # the gyros' bias puts what `inspect` and `run` give in doubt
-        assert run(*line.split()) == (0 if line.startswith("convert") else 3)
-        printed.append(capsys.readouterr().out)
+    # the gyros' bias puts what `inspect` and `run` give in doubt
+    printed = [
+        reply(0 if line.startswith("convert") else 3, *line.split()).out
+        for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE)
+    ]
     assert len(printed) == 3
     assert re.search(
         r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act",

@@ -70,10 +70,9 @@ def test_sentences_say_whether_to_act(log):
 
 
 def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
-    run, basin, monkeypatch, capsys
+    basin, monkeypatch, reply
 ):
-    assert run("inspect", basin) == 0
-    shown = capsys.readouterr().out
+    shown = reply(0, "inspect", basin).out
     for name in (
         "sensor_msgs/msg/Imu",
         "marine_acoustic_msgs/msg/Dvl",
@@ -84,19 +83,18 @@ def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
     monkeypatch.setattr(
         LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)")
     )
-    assert run("inspect", basin) == 1
-    *_, lack, advice = capsys.readouterr().out.splitlines()
+    *_, lack, advice = reply(1, "inspect", basin).out.splitlines()
     assert lack == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
     assert "--toml > log.toml" in advice
 
 
 def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
-    run, basin, monkeypatch, capsys
+    basin, monkeypatch, reply
 ):
     monkeypatch.setattr("sonar_graph.cli.inspect_log.MOST_TOPICS", 2)
-    assert run("inspect", basin, "--quick") == 0
     shown, hidden = re.search(
-        r"(?s)(.*?)not shown (\d+) more topics", capsys.readouterr().out
+        r"(?s)(.*?)not shown (\d+) more topics",
+        reply(0, "inspect", basin, "--quick").out,
     ).groups()
     topics = {topic["name"] for topic in answer(basin, "--quick")["topics"]}
     assert len(topics) == 2 + int(hidden)

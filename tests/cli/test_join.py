@@ -50,12 +50,9 @@ def both(lane, tmp_path_factory) -> tuple[Path, Path]:
     return images_log(lane, folder / "images.mcap"), folder / "nav.mcap"
 
 
-def test_images_are_moved_to_the_clock_of_the_navigation(
-    lane, both, run, tmp_path, capsys
-):
+def test_images_are_moved_to_the_clock_of_the_navigation(lane, both, tmp_path, reply):
     out = tmp_path / "joined.mcap"
-    assert run("join", *both, "-o", out) == 0
-    said = capsys.readouterr().out
+    said = reply(0, "join", *both, "-o", out).out
     match = re.search(
         r"Clock offset, to be added .*: \+(\d\.\d+) s ± (\d\.\d+) s", said
     )
@@ -123,42 +120,40 @@ def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
 
 
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
-    lane, both, run, tmp_path, capsys
+    lane, both, tmp_path, reply
 ):
     out = tmp_path / "joined.mcap"
-    assert run("join", *both, "-o", out, "--offset", OFFSET_S) == 0
-    said = capsys.readouterr().out
+    said = reply(0, "join", *both, "-o", out, "--offset", OFFSET_S).out
     assert "+2.400 s, as stated; by the images +2.4" in said
     assert "Warning" not in said
     stamps = np.concatenate([block.stamps_ns for block in read_sonar_frames(out)])
     np.testing.assert_array_equal(stamps, lane.frames.stamps_ns)
-    assert run("join", *both, "-o", out, "--offset", 3.5) == 0
-    assert "Warning: they do not agree" in capsys.readouterr().out
+    assert (
+        "Warning: they do not agree"
+        in reply(0, "join", *both, "-o", out, "--offset", 3.5).out
+    )
 
 
 def test_files_without_common_time_are_refused_with_an_offset(
-    lane, both, run, tmp_path, capsys
+    lane, both, tmp_path, reply
 ):
     far = images_log(lane, tmp_path / "far.mcap", offset_s=1.2e9)
     out = tmp_path / "joined.mcap"
-    assert run("join", far, both[1], "-o", out) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = reply(2, "join", far, both[1], "-o", out).err.splitlines()
     found = re.search(
         r"far\.mcap: \d.* s; .*nav\.mcap: \d.* s: no common time; .* \(\+(\d+\.\d+) makes",
         line,
     )
     assert found
     assert not out.exists()
-    assert (
-        run("join", far, both[1], "-o", out, "--offset", float(found[1]), "--search", 3)
-        == 0
-    )
-    refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", capsys.readouterr().out)
+    words = "-o", out, "--offset", float(found[1]), "--search", 3
+    said = reply(0, "join", far, both[1], *words).out
+    refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", said)
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
 def test_an_offset_that_few_images_cannot_show_must_be_stated(
-    both, run, tmp_path, capsys
+    both, run, tmp_path, reply
 ):
     file = tmp_path / "dive.aris"
     file.write_bytes(Aris(images(6, 128, 300)).content())
@@ -166,26 +161,10 @@ def test_an_offset_that_few_images_cannot_show_must_be_stated(
     first_ns = next(read_sonar_frames(recorded)).stamps_ns[0]
     offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
     out = tmp_path / "joined.mcap"
-    assert (
-        run(
-            "join",
-            recorded,
-            both[1],
-            "-o",
-            out,
-            "--offset",
-            f"{offset_s:.6f}",
-            "--search",
-            2,
-        )
-        == 2
-    )
-    assert (
-        "steps between them could be measured, and 50 are needed; state it"
-        in capsys.readouterr().err
-    )
-    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
-    assert "as stated; the images do not determine" in capsys.readouterr().out
+    words = "join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}"
+    few = "steps between them could be measured, and 50 are needed; state it"
+    assert few in reply(2, *words, "--search", 2).err
+    assert "as stated; the images do not determine" in reply(0, *words).out
     assert sum(len(block) for block in read_sonar_frames(out)) == 6
 
 

@@ -160,15 +160,14 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("command", "expected"), MISTAKES.items())
 def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
-    run, command, expected, files, monkeypatch, capsys
+    command, expected, files, monkeypatch, reply
 ):
     def content() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in files.rglob("*") if path.is_file()}
 
     before = content()
     monkeypatch.chdir(files)
-    assert run(*command.split()) == 2
-    said = capsys.readouterr().err
+    said = reply(2, *command.split()).err
     assert re.fullmatch(r"sonar-graph: .+\n", said)
     assert re.search(expected, said), said
     assert content() == before
@@ -178,11 +177,13 @@ def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
     "stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")]
 )
 def test_interruption_and_refused_access_end_in_one_line(
-    run, stop, basin, monkeypatch, capsys
+    stop, basin, monkeypatch, reply
 ):
     monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(stop))
-    assert run("inspect", basin) == (130 if stop is KeyboardInterrupt else 2)
-    assert re.fullmatch(r"sonar-graph: .+\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"sonar-graph: .+\n",
+        reply(130 if stop is KeyboardInterrupt else 2, "inspect", basin).err,
+    )
 
 
 def test_unforeseen_error_is_not_hidden(basin, monkeypatch):

@@ -114,12 +114,11 @@ WRONG = {
 
 @pytest.mark.parametrize(("command", "expected"), WRONG.items())
 def test_a_wrong_use_is_one_line_that_says_what_to_do(
-    run, folder, command, expected, monkeypatch, capsys
+    folder, command, expected, monkeypatch, reply
 ):
     before = sorted(folder.rglob("*"))
     monkeypatch.chdir(folder)
-    assert run(*command.split()) == 2
-    said = capsys.readouterr().err
+    said = reply(2, *command.split()).err
     assert re.fullmatch(r"sonar-graph: .+\n", said)
     assert re.search(expected, said), said
     assert sorted(folder.rglob("*")) == before
@@ -147,9 +146,7 @@ def test_a_truth_of_tables_may_lack_its_orientation(folder, tmp_path):
         read_csv(tables, config)
 
 
-def test_tables_with_another_unit_of_velocity_are_reported(
-    run, folder, tmp_path, capsys
-):
+def test_tables_with_another_unit_of_velocity_are_reported(folder, tmp_path, reply):
     (tmp_path / "dive.toml").write_text(GOOD + "scale = 1000\n")
     out = tmp_path / "new.mcap"
     for config, told in (
@@ -159,11 +156,17 @@ def test_tables_with_another_unit_of_velocity_are_reported(
         ),
         (folder / "good.toml", "^((?!: unit).)*$"),
     ):
-        assert run("convert", "csv", folder, "--config", config, "-o", out) == 0
-        assert re.search(told, " ".join(capsys.readouterr().err.split()))
+        assert re.search(
+            told,
+            " ".join(
+                reply(
+                    0, "convert", "csv", folder, "--config", config, "-o", out
+                ).err.split()
+            ),
+        )
 
 
-def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):
+def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, reply):
     world = small_world()
     assert run("inspect", folder / "dive.mcap", "--quick") == 0
     assert run("inspect", folder / "fast.mcap") == 3
@@ -172,8 +175,7 @@ def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, capsys):
     assert run("inspect", tmp_path / "frd.mcap", "--quick") == 3
     content = (folder / "dive.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
-    assert run("inspect", tmp_path / "cut.mcap", "--quick") == 1
-    capsys.readouterr()
+    reply(1, "inspect", tmp_path / "cut.mcap", "--quick")
 
 
 @pytest.mark.parametrize("content", ['{"a": 1}', "words", "[]"])
