@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +48,14 @@ def nobody(_run: PlannedRun, _outcome: RunOutcome) -> None:
     """Receives progress."""
 
 
+def opened(suite: Path, folder: Path) -> AbstractContextManager[Batch]:
+    return Batch.opened(read_suite(suite), folder)
+
+
 def table(folder: Path) -> list[dict[str, Any]]:
-    rows = pq.read_table(folder / RESULTS).to_pylist()
-    return [
-        {name: value for name, value in row.items() if not is_timing(name)}
-        for row in rows
-    ]
+    """Rows without times."""
+    found = pq.read_table(folder / RESULTS)
+    return found.drop_columns(list(filter(is_timing, found.column_names))).to_pylist()
 
 
 def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
@@ -83,7 +86,7 @@ def statuses_after(batch: Batch) -> Counter[str]:
 
 
 def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
-    with Batch.opened(read_suite(suite), folder) as batch:
+    with opened(suite, folder) as batch:
         assert statuses_after(batch) == {"ok": 4}
     return table(folder)
 
@@ -103,7 +106,7 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
     for count in (1, 2, 3):
         monkeypatch.setattr(cluster, "run_batch", interrupted)
         with (
-            Batch.opened(read_suite(suite), tmp_path / "b") as batch,
+            opened(suite, tmp_path / "b") as batch,
             pytest.raises(KeyboardInterrupt),
         ):
             batch.run(HERE, LIMITS, nobody)
@@ -136,7 +139,7 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
     monkeypatch.setattr(cluster, "run_batch", kept)
     folder = tmp_path / "out"
     with (
-        Batch.opened(read_suite(suite), folder) as batch,
+        opened(suite, folder) as batch,
         monkeypatch.context() as patch,
     ):
         patch.setattr(batch_module, "write_results", no_space)
@@ -191,13 +194,13 @@ def test_a_changed_suite_resumes_in_its_folder(
     folder = tmp_path / "out"
     text = suite.read_text()
     suite.write_text(text + '[[estimators]]\nname = "no such"\n')
-    with pytest.raises(BatchError), Batch.opened(read_suite(suite), folder):
+    with pytest.raises(BatchError), opened(suite, folder):
         pass
     assert not folder.exists(), "a suite with a mistake makes no folder"
     suite.write_text(text)
     before = finished(suite, folder)
     suite.write_text(text := text.replace("seeds = 4", "seeds = 5"))
-    with Batch.opened(read_suite(suite), folder) as batch:
+    with opened(suite, folder) as batch:
         assert len(batch.rows()) == 4
         batch.run(HERE, LIMITS, nobody)
     assert table(folder)[:4] == before
@@ -205,7 +208,7 @@ def test_a_changed_suite_resumes_in_its_folder(
     kept = contents(folder)
     suite.write_text(text.replace("short", "other"))
     told = r"holds the batch of suite 'short', and .* is suite 'other'; choose another"
-    with pytest.raises(BatchError, match=told), Batch.opened(read_suite(suite), folder):
+    with pytest.raises(BatchError, match=told), opened(suite, folder):
         pass
     suite.write_text(text.replace("duration_s = 120", "duration_s = 125"))
     kill(suite, folder, 0, monkeypatch)
@@ -218,7 +221,7 @@ def test_a_changed_suite_resumes_in_its_folder(
 def test_failed_runs_are_kept_until_they_are_discarded(
     suite, tmp_path, in_this_process
 ):
-    with Batch.opened(read_suite(suite), tmp_path) as batch:
+    with opened(suite, tmp_path) as batch:
         batch.store.write(
             batch.runs[0].key,
             RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}),
@@ -247,7 +250,7 @@ def kill(
         raise Died
 
     monkeypatch.setattr(cluster, "run_batch", killed)
-    with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Died):
+    with opened(suite, folder) as batch, pytest.raises(Died):
         batch.run(HERE, LIMITS, nobody)
 
 
