@@ -19,20 +19,25 @@ EPOCH_S = 1_777_638_600.0
 
 
 def dive(imu_hz: float = 50.0, every: int = 10) -> SimpleNamespace:
-    """Rates, forces, velocities, depths and bearings of a dive; the Doppler log has every n-th time of the IMU."""
+    """Rates and forces of a dive; its Doppler log, depths and bearings have every n-th time of the IMU."""
     rng = np.random.default_rng(7)
     s = np.arange(ROWS) / imu_hz
+    slow = s[::every]
+    turns = np.sin(slow), np.cos(slow), np.sin(2 * slow)
     return SimpleNamespace(
         s=s,
-        slow=slice(0, ROWS, every),
+        slow=slow,
         rate=rng.normal(0, 0.1, (ROWS, 3)),
         force=rng.normal([0, 0, 9.81], 0.05, (ROWS, 3)),
-        velocity=np.column_stack(
-            [0.8 + 0.3 * np.sin(s), 0.1 * np.cos(s), 0.05 * np.sin(2 * s)]
-        ),
-        depth=4 + np.sin(0.3 * s),
-        bearing=(300 + 40 * np.sin(0.5 * s)) % 360,
+        velocity=np.column_stack(turns) * [0.3, 0.1, 0.05] + [0.8, 0, 0],
+        depth=4 + np.sin(0.3 * slow),
+        bearing=(300 + 40 * np.sin(0.5 * slow)) % 360,
     )
+
+
+@pytest.fixture
+def d() -> SimpleNamespace:
+    return dive()
 
 
 def write(
@@ -88,12 +93,8 @@ def assert_is(sequence, dive: SimpleNamespace, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(
         sequence.imu.angular_velocity, dive.rate, rtol=0, atol=atol
     )
-    np.testing.assert_allclose(
-        sequence.dvl.velocity, dive.velocity[dive.slow], rtol=0, atol=atol
-    )
-    np.testing.assert_allclose(
-        -sequence.depth.z_m, dive.depth[dive.slow], rtol=0, atol=atol
-    )
+    np.testing.assert_allclose(sequence.dvl.velocity, dive.velocity, rtol=0, atol=atol)
+    np.testing.assert_allclose(-sequence.depth.z_m, dive.depth, rtol=0, atol=atol)
 
 
 @pytest.fixture
@@ -111,15 +112,14 @@ def plain(
     start_s: float = 0.0,
 ) -> None:
     """The tables of a dive that a test does not write in its own way."""
-    k = d.slow
-    t = np.round((start_s + d.s) * scale, 9)
+    t, slow = (np.round((start_s + s) * scale, 9) for s in (d.s, d.slow))
     if "imu" in names:
         header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
         write(folder / "imu.csv", header, t, *d.rate.T, *d.force.T)
     if "dvl" in names:
-        write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", t[k], *d.velocity[k].T)
+        write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", slow, *d.velocity.T)
     if "depth" in names:
-        write(folder / "depth.csv", "time,depth", t[k], d.depth[k])
+        write(folder / "depth.csv", "time,depth", slow, d.depth)
 
 
 def comma(value: float) -> str:
@@ -153,15 +153,13 @@ TOOLS = {
 
 
 @pytest.mark.parametrize("tool", TOOLS)
-def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool):
-    d = dive()
-    k = d.slow
+def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool, d):
     of_imu, of_dvl, form, (force, velocity, depth), how = TOOLS[tool]
-    stamps = 1e3 * d.s if form is None else dates(d.s, form)
+    stamps, slow = (1e3 * s if form is None else dates(s, form) for s in (d.s, d.slow))
     columns = (*np.degrees(d.rate).T, *(force * d.force).T)
     write(folder / "imu.csv", of_imu, stamps, *columns, **how)
-    columns = (*(velocity * d.velocity[k]).T, depth * d.depth[k])
-    write(folder / "dvl.csv", of_dvl, stamps[k], *columns, **how)
+    columns = (*(velocity * d.velocity).T, depth * d.depth)
+    write(folder / "dvl.csv", of_dvl, slow, *columns, **how)
     imu = template(folder)[1]["imu"]
     if "encoding" in how:
         assert (imu["decimal"], imu["encoding"]) == (",", "cp1252")
@@ -197,9 +195,8 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
 def test_units_of_times_follow_from_the_sensors_rates(
     folder, tmp_path, imu_hz, every, scale
 ):
-    d = dive(imu_hz, every)
     # enough rows of the Doppler log for a rate
-    d.slow = slice(0, ROWS, every // 4)
+    d = dive(imu_hz, every // 4)
     plain(folder, d, "imu", "dvl", "depth", scale=scale)
     sequence = guessed(folder, tmp_path)
     assert sequence.duration_s == pytest.approx(d.s[-1], rel=0.1)
@@ -209,9 +206,8 @@ def test_units_of_times_follow_from_the_sensors_rates(
 
 
 def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(
-    folder, tmp_path
+    folder, tmp_path, d
 ):
-    d = dive()
     plain(folder, d, "imu", "dvl", "depth", scale=1e3)
     for path in folder.iterdir():
         path.write_text(path.read_text().replace("time", "time [s]"))
@@ -228,8 +224,7 @@ def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(
         ("heading", "time,yaw"),
     ],
 )
-def test_a_column_that_never_changes_is_no_motion(folder, name, header):
-    d = dive()
+def test_a_column_that_never_changes_is_no_motion(folder, name, header, d):
     plain(folder, d, "imu", "dvl", "depth")
     count = header.count(",")
     write(folder / f"{name}.csv", header, d.s, *np.full((count, ROWS), 0.5))
@@ -241,25 +236,21 @@ def test_a_column_that_never_changes_is_no_motion(folder, name, header):
 # --- tables of other tools, and what they must not be taken for -------------------------------------------------------
 
 
-def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path):
-    d = dive()
+def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path, d):
     plain(folder, d, "imu", "dvl")
-    k = d.slow
-    decibar = d.depth[k] * 9.80665 / 10
-    write(folder / "ctd.csv", "time;Pressure (dbar)", d.s[k], decibar, sep=";")
+    decibar = d.depth * 9.80665 / 10
+    write(folder / "ctd.csv", "time;Pressure (dbar)", d.slow, decibar, sep=";")
     depth_m = -guessed(folder, tmp_path).depth.z_m
-    np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
+    np.testing.assert_allclose(depth_m, d.depth, rtol=5e-3)
 
 
-def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
-    d = dive()
-    k = d.slow
+def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path, d):
     paths = [f"/imu/{kind}/{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz"]  # fmt: skip
     header = ",".join(["__time", *paths])
     write(folder / "imu.csv", header, EPOCH_S + d.s, *d.rate.T, *d.force.T)
-    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.s[k]]
+    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.slow]
     header = "%time,field.header.frame_id,field.velocity.x,field.velocity.y,field.velocity.z,field.depth"
-    columns = (ns, ["dvl"] * len(ns), *d.velocity[k].T, d.depth[k])
+    columns = (ns, ["dvl"] * len(ns), *d.velocity.T, d.depth)
     write(folder / "dvl.csv", header, *columns)
     assert_is(guessed(folder, tmp_path), d)
 
@@ -271,8 +262,7 @@ def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
         "%H:%M:%S.@",
     ],
 )
-def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form):
-    d = dive()
+def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form, d):
     plain(folder, d, "dvl", "depth")
     header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
     write(folder / "imu.csv", header, dates(d.s, form), *d.rate.T, *d.force.T)
@@ -280,12 +270,10 @@ def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, fo
         guessed(folder, tmp_path)
 
 
-def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
-    d = dive()
+def test_numbers_with_thousands_separators_are_refused(folder, tmp_path, d):
     plain(folder, d, "imu", "dvl")
-    k = d.slow
-    cells = [f"{depth:,.1f}" for depth in 1000 * d.depth[k]]
-    write(folder / "depth.csv", "time;depth [mm]", d.s[k], cells, sep=";")
+    cells = [f"{depth:,.1f}" for depth in 1000 * d.depth]
+    write(folder / "depth.csv", "time;depth [mm]", d.slow, cells, sep=";")
     with pytest.raises(
         LogError, match=r"depth\.csv, line 2: .*'4,000\.0' is no number"
     ):
@@ -294,30 +282,28 @@ def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
 
 @pytest.mark.parametrize(("name", "held"), [("velocity_valid", 1), ("velo_flag", 0)])
 def test_a_column_of_validity_is_proposed_and_missed_where_it_is_not_used(
-    folder, tmp_path, name, held
+    folder, tmp_path, name, held, d
 ):
     """By its name, or by velocities that are zero in the marked rows; the header has no unit."""
-    d = dive()
     plain(folder, d, "imu", "depth")
-    k = d.slow
-    is_lost = np.isin(np.arange(len(d.s[k])), range(10, 20))
-    velocity = 1000 * d.velocity[k] * np.where(is_lost, held, 1)[:, None]
+    is_lost = np.isin(np.arange(len(d.slow)), range(10, 20))
+    velocity = 1000 * d.velocity * np.where(is_lost, held, 1)[:, None]
     marks = np.where(is_lost, "false", "true").tolist()
     header = f"time,vel_x,vel_y,vel_z,{name}"
-    write(folder / "dvl.csv", header, d.s[k], *velocity.T, marks)
+    write(folder / "dvl.csv", header, d.slow, *velocity.T, marks)
     config = template(folder)[1]
     assert config["dvl"]["valid_where"] == {name: 1}
     assert config["dvl"]["scale"] == "mm/s"
     found = guessed(folder, tmp_path).dvl.velocity
-    np.testing.assert_allclose(found, d.velocity[k][~is_lost], atol=1e-9)
+    np.testing.assert_allclose(found, d.velocity[~is_lost], atol=1e-9)
     del config["dvl"]["valid_where"]
     warning = read_csv(folder, config).notes["csv.warnings"]
     assert f"column {name} is 0 in 10 of 60 rows and not used" in warning
     assert f"`valid_where = {{{name} = 1}}`" in warning
 
 
-def test_a_sonar_without_identities_states_it_by_false(folder):
-    plain(folder, dive(), "imu", "dvl")
+def test_a_sonar_without_identities_states_it_by_false(folder, d):
+    plain(folder, d, "imu", "dvl")
     (folder / "seen.csv").write_text("time,range,azimuth\n1.0,3.0,0.1\n2.0,3.0,0.2\n")
     config = template(folder)[1]
     assert config["detections"]["ids"] is False
