@@ -256,7 +256,7 @@ def sources_of(file: SuiteFile) -> list[_Source]:
             try:
                 kind.check(options)
             except SonarGraphError as error:
-                file.refuse((*place, *(of_log or ["options"])), str(error))
+                file.refuse((*place, "log" if of_log else "options"), str(error))
             plain = options.model_dump(mode="json", exclude={"seed"})
             content = fingerprint(entry.kind, plain)
             stated = {name: values[name] for name in values if name not in FILES}
@@ -378,7 +378,7 @@ def source_hash(package: str) -> str:
             name = entry.path[len(folder) + 1 :].replace(os.sep, "/")
             files.append((name, entry.path, stamp_of(entry)))
     module = Path(spec.origin or "")
-    if spec.submodule_search_locations is None and module.is_file():
+    if not spec.submodule_search_locations and module.is_file():
         files.append((module.name, str(module), stamp_of(module)))
     return content_hash(tuple(sorted(files)))[:DIGITS] if files else ""
 
