@@ -1,5 +1,6 @@
 """Nothing of the user's is lost: files of others, links, pipes, a second command, an end in the middle."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from sonar_graph.files import (
     write_json,
     written_whole,
 )
+from tests.dying import Died, dies_after
 
 KIND = "comparison"
 
@@ -144,54 +146,30 @@ def test_an_interrupted_file_leaves_nothing_not_even_its_folder(
     assert list(tmp_path.rglob("*")) == before
 
 
-def test_killed_between_two_files_all_are_still_known_as_ours(tmp_path, monkeypatch):
-    write(tmp_path, {"a.json": "1", "b.json": "1"})
-    replace = Path.replace
-
-    def dies(self: Path, target: Path) -> Path:
-        if target == tmp_path / "b.json":
-            raise OSError("killed")
-        return replace(self, target)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", dies)
-        with pytest.raises(OSError, match="killed"):
-            write(tmp_path, {"a.json": "{}\n", "b.json": "{}\n"}, is_amended=True)
-    assert contents(tmp_path) == {"a.json": "{}\n", "b.json": "1"}
-    write(tmp_path, {"a.json": "3", "b.json": "3"})
-    assert contents(tmp_path) == {"a.json": "3", "b.json": "3"}
-
-
-WRITER = """
-import os, sys
-from pathlib import Path
-from sonar_graph.files import replacing, result_written
-
-with result_written(Path(sys.argv[1]), "comparison"), replacing(Path(sys.argv[1]) / "runs" / "a.json") as partial:
-    partial.write_text("half")
-    with replacing(Path(sys.argv[1]) / "b.json") as other:
-        other.write_text("half")
-    os.kill(os.getpid(), 9)
-"""
-
-
-@pytest.mark.parametrize("is_new", [False, True])
-def test_what_a_killed_command_left_is_removed_by_the_next_one(tmp_path, is_new):
-    if not is_new:
-        write(tmp_path, {"a.json": "1"})
+@pytest.mark.parametrize("steps", range(60))
+def test_killed_at_any_step_all_is_whole_and_known_as_ours(
+    tmp_path, monkeypatch, steps
+):
+    folder = tmp_path / "out"
     mine = {f".{name}.{'0' * 24}.partial.json": "mine" for name in "ab"}
+    before = {"a.json": "1", "runs/x/b.json": "1"}
+    after = {"a.json": "{}\n", "runs/y/b.json": "2"}
+    if steps % 2:
+        write(folder, before)
+    folder.mkdir(exist_ok=True)
     for name, content in mine.items():
-        (tmp_path / name).write_text(content)
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", WRITER, str(tmp_path)], check=False
-        ).returncode
-        == -9
-    )
-    assert len(contents(tmp_path)) == len(mine) + 2 + (not is_new)
-    write(tmp_path, {"a.json": "2"})
-    assert contents(tmp_path) == mine | {"a.json": "2"}
-    assert not (tmp_path / "runs").exists()
+        (folder / name).write_text(content)
+    with monkeypatch.context() as patch, contextlib.suppress(Died):
+        dies_after(steps // 2, patch)
+        write(folder, after)
+    whole = (before | mine).items() | after.items()
+    partial = folder / ".sonar_graph.partial"
+    found = contents(folder)
+    assert {
+        f for f in found.items() if not (folder / f[0]).is_relative_to(partial)
+    } <= whole
+    write(folder, {"a.json": "3"})
+    assert contents(folder) == mine | {"a.json": "3"}
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -42,20 +42,14 @@ TWO_DIMENSIONS = 2
 LOG = logging.getLogger(__name__)
 
 
-@dataclass
-class Clock:
-    """Seconds by activity."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def on(self, activity: str) -> Iterator[None]:
-        """Measure the block, also if it ends with an error."""
-        before = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[activity] = time.perf_counter() - before
+@contextmanager
+def timed(seconds: dict[str, float], activity: str) -> Iterator[None]:
+    """Measure the seconds of the block, also if it ends with an error."""
+    before = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[activity] = time.perf_counter() - before
 
 
 def perform(run: PlannedRun, folder: Path) -> Row:
@@ -73,20 +67,15 @@ def perform(run: PlannedRun, folder: Path) -> Row:
             f"a worker has {_told(here, differing)}, planned with {_told(run.versions, differing)}; "
             "install the same everywhere and start the workers anew"
         )
-    clock = Clock()
+    seconds: dict[str, float] = {}
     # processor time is nearly free of the load of the machine, unlike the time of the clock
     cpu_before_s = time.process_time()
     try:
-        with clock.on("read_s"):
-            sequence = _sequence(
-                run.kind,
-                _text(run.options),
-                _text(run.content),
-                run.seed,
-                _text(run.landmarks),
-            )
+        with timed(seconds, "read_s"):
+            source = run.kind, run.options, run.content, run.seed, run.landmarks
+            sequence = _sequence(json.dumps(source, sort_keys=True))
             instants_ns = sequence.instants(run.rate_hz)
-        with clock.on("estimate_s"):
+        with timed(seconds, "estimate_s"):
             # supervision has given this run a process of its own already
             result = run_here(sequence, run.estimator, run.overrides, instants_ns)
         comparison = judge(sequence, instants_ns, [result])
@@ -98,7 +87,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         LOG.exception("run %s", run.key)
         stage = (
             "while judging"
-            if "estimate_s" in clock.seconds
+            if "estimate_s" in seconds
             else "while reading or simulating the log"
         )
         row: Row = {
@@ -112,7 +101,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         write_comparison(comparison, folder)
         row = measured(comparison)
         row |= {name: sequence.notes.get(f"log.{name}") for name in FINDINGS}
-    row |= {**clock.seconds, "cpu_s": time.process_time() - cpu_before_s}
+    row |= {**seconds, "cpu_s": time.process_time() - cpu_before_s}
     return row
 
 
@@ -127,38 +116,29 @@ def warm_up(run: PlannedRun) -> None:
         tempfile.TemporaryDirectory(prefix="sonar-graph-warm-up-") as scratch,
     ):
         kind, options = WARM_UP_LOG
+        of_basin = replace(run, kind=kind, options=options, landmarks=None, seed=0)
         content = fingerprint(kind, options)
-        perform(
-            replace(
-                run, kind=kind, options=options, content=content, landmarks=None, seed=0
-            ),
-            Path(scratch),
-        )
+        perform(replace(of_basin, content=content), Path(scratch))
 
 
 @lru_cache(KEPT_SEQUENCES)
-def _sequence(
-    kind: str, options: str, content: str, seed: int | None, landmarks: str
-) -> Sequence:
-    """Sequence of a source; arguments are JSON texts. Equal arguments give the same object, which must not be changed.
+def _sequence(source: str) -> Sequence:
+    """Sequence of a source: JSON of kind, options, content, seed and landmarks of a run.
 
-    Raises `BatchError` when files are not what they were when the run was planned.
+    Equal sources give the same object, which must not be changed. Raises `BatchError` when files are not what they were
+    when the run was planned.
     """
-    values = json.loads(options)
-    sequence = read_source(kind, values, seed, json.loads(landmarks))
-    sequence = with_findings(kind, values, sequence)
-    _check_content(kind, values, content)
-    return sequence
-
-
-def _check_content(kind: str, options: dict[str, Any], content: str) -> None:
-    if differing := _differing(fingerprint(kind, options), json.loads(content)):
+    kind, options, content, seed, landmarks = json.loads(source)
+    sequence = read_source(kind, options, seed, landmarks)
+    sequence = with_findings(kind, options, sequence)
+    if differing := _differing(fingerprint(kind, options), content):
         names = ", ".join(
             f"{name} {options.get(name, '')}".rstrip() for name in differing
         )
         raise BatchError(
             f"{platform.node()}: {names}: not what it was when the run was planned; start the batch anew"
         )
+    return sequence
 
 
 def measured(comparison: Comparison) -> Row:
@@ -168,10 +148,9 @@ def measured(comparison: Comparison) -> Row:
     independent, so their average has a chi-square band; an average over the instants of one run has none.
     """
     (run,) = comparison.runs
+    scores = comparison.scores[run.estimator]
     row: Row = {
-        key: score.value for key, score in comparison.scores[run.estimator].items()
-    }
-    row |= {
+        **{key: score.value for key, score in scores.items()},
         **_versions(comparison.environment),
         "status": run.status,
         "reason": run.reason,
@@ -191,11 +170,8 @@ def measured(comparison: Comparison) -> Row:
         ):
             row[f"{kind}.nees_{key}_end"] = float(nees[-1] / dof)
             row |= {f"{kind}.nees_{key}_dof": dof, f"{kind}.nees_{key}_end_dof": dof}
-    row |= {
-        f"{key}_dof": TWO_DIMENSIONS
-        for key in ("landmarks.nees", "detections.nis")
-        if key in row
-    }
+    planar = row.keys() & {"landmarks.nees", "detections.nis"}
+    row |= {f"{key}_dof": TWO_DIMENSIONS for key in planar}
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in row.items()
@@ -203,14 +179,8 @@ def measured(comparison: Comparison) -> Row:
 
 
 def _versions(environment: dict[str, str]) -> Row:
-    return {
-        key: environment[key]
-        for key in ("sonar_graph", *LIBRARIES, "python", "machine")
-    }
-
-
-def _text(values: dict[str, Any] | None) -> str:
-    return json.dumps(values, sort_keys=True)
+    names = ("sonar_graph", *LIBRARIES, "python", "machine")
+    return {name: environment[name] for name in names}
 
 
 def _differing(here: dict[str, Any], planned: dict[str, Any]) -> list[str]:
@@ -231,15 +201,12 @@ def answer(request: PlannedRun | Preparation, _tell: Tell) -> object:
     with tempfile.TemporaryDirectory(prefix="sonar-graph-run-") as scratch:
         folder = Path(scratch)
         row = perform(request, folder)
-        paths = sorted(
-            path
-            for path in folder.rglob("*")
+        files = {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in sorted(folder.rglob("*"))
             if path.is_file() and path.name not in (MANIFEST, LOCK)
-        )
-        return RunOutcome(
-            row,
-            {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths},
-        )
+        }
+        return RunOutcome(row, files)
 
 
 if __name__ == "__main__":

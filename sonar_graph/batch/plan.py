@@ -21,11 +21,11 @@ from pydantic import ValidationError
 
 from sonar_graph.batch.recorded import ALL_LOGS
 from sonar_graph.batch.sources import (
+    DATASETS,
     FILE,
     FILES,
     GENERATORS,
     KINDS,
-    LOG,
     content_hash,
     files_below,
     fingerprint,
@@ -110,14 +110,11 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
             }
             # sorted, so that the order of settings in a suite changes no key
             text = json.dumps(decides, sort_keys=True, default=str)
+            hashed = source.content.keys() & {*FILES, FILE}
             asked = {
                 "generator": source.entry.kind,
                 "options": source.stated,
-                "files": {
-                    name: hashed
-                    for name, hashed in source.content.items()
-                    if name in (*FILES, FILE)
-                },
+                "files": {name: source.content[name] for name in hashed},
                 "landmarks": source.entry.landmarks,
                 "settings": contestant.overrides,
                 "rate_hz": rate_hz,
@@ -172,9 +169,8 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
             given = values = nested(chosen, entry.params)
             if model is not None:
                 table = _table_of(chosen, "params")
-                values = _validated(file, place, model, given, table).model_dump(
-                    mode="json"
-                )
+                params = _validated(file, place, model, given, table)
+                values = params.model_dump(mode="json")
             elif foreign:
                 try:
                     values = check_request(entry.name, given) or given
@@ -213,13 +209,12 @@ def sources_of(file: SuiteFile) -> list[_Source]:
     found: list[_Source] = []
     for number, entry in enumerate(file.suite.logs):
         place: Place = ("logs", number)
-        known = [
-            name
-            for name in KINDS
-            if name != LOG and (name in GENERATORS) == (entry.generator is not None)
-        ]
-        if entry.kind != LOG and entry.kind not in known:
-            what = "generator" if entry.generator is not None else "dataset"
+        what = "dataset"
+        known = DATASETS
+        if entry.generator is not None:
+            what = "generator"
+            known = GENERATORS
+        if entry.log is None and entry.kind not in known:
             file.refuse(
                 (*place, what),
                 f"there is no {what} {entry.kind!r}; there are: {', '.join(known)}",
@@ -246,46 +241,27 @@ def sources_of(file: SuiteFile) -> list[_Source]:
                 )
             _validated(file, (*place, "landmarks"), LandmarkOptions, entry.landmarks)
         for chosen in _combinations(file, place, entry.grid, entry.options, "options"):
-            values = (
-                ({} if entry.log is None else {"log": entry.log})
-                | entry.options
-                | chosen
-            )
-            named = [
-                values[name] for name in FILES if isinstance(values.get(name), str)
-            ]
+            of_log = {} if entry.log is None else {"log": entry.log}
+            values = of_log | entry.options | chosen
+            named = [name for name in FILES if isinstance(values.get(name), str)]
             # a suite that ships must run without the data sets that cannot be shipped
-            if entry.obtain and not all(map(file.holds, named)):
+            if entry.obtain and not all(file.holds(values[name]) for name in named):
                 continue
-            for name in FILES:
-                if isinstance(values.get(name), str):
-                    where = (
-                        (*place, name) if name == "log" else (*place, "options", name)
-                    )
-                    values[name] = file.find(where, values[name])
-            options = _validated(
-                file,
-                place,
-                KINDS[entry.kind].options,
-                values,
-                _table_of(chosen, "options"),
-            )
+            for name in named:
+                where = ("log",) if name == "log" else ("options", name)
+                values[name] = file.find((*place, *where), values[name])
+            kind = KINDS[entry.kind]
+            table = _table_of(chosen, "options")
+            options = _validated(file, place, kind.options, values, table)
             try:
-                KINDS[entry.kind].check(options)
+                kind.check(options)
             except SonarGraphError as error:
-                file.refuse(
-                    (*place, "log" if entry.log is not None else "options"), str(error)
-                )
+                file.refuse((*place, "log" if of_log else "options"), str(error))
             plain = options.model_dump(mode="json", exclude={"seed"})
-            stated = {
-                name: value for name, value in values.items() if name not in FILES
-            }
+            content = fingerprint(entry.kind, plain)
+            stated = {name: values[name] for name in values if name not in FILES}
             label = _label(entry.name, chosen)
-            found.append(
-                _Source(
-                    place, entry, label, plain, fingerprint(entry.kind, plain), stated
-                )
-            )
+            found.append(_Source(place, entry, label, plain, content, stated))
     if not found:
         file.refuse(
             ("logs",),
@@ -357,12 +333,8 @@ def _validated(
 
 def _label(name: str, chosen: dict[str, Any]) -> str:
     """Name with the values that a grid chose."""
-    return ", ".join(
-        [
-            *([name] if name else []),
-            *(f"{key}={value}" for key, value in chosen.items()),
-        ]
-    )
+    parts = [name, *(f"{key}={value}" for key, value in chosen.items())]
+    return ", ".join(filter(None, parts))
 
 
 @lru_cache
@@ -383,13 +355,8 @@ def versions_of(estimator: str) -> dict[str, str]:
         "python": platform.python_version(),
         "estimator_target": point.value,
         "source": source_hash("sonar_graph"),
-        "estimator_source": source_hash(_package(point.value)),
+        "estimator_source": source_hash(point.module.partition(".")[0]),
     }
-
-
-def _package(target: str) -> str:
-    """Top-level package of an entry point's target."""
-    return target.partition(":")[0].partition(".")[0]
 
 
 @lru_cache
@@ -404,23 +371,17 @@ def source_hash(package: str) -> str:
     spec = find_spec(package)
     if spec is None:
         return ""
+    files = []
     # a namespace package has several folders, a module none
-    folders = list(spec.submodule_search_locations or ())
-    files = [
-        (
-            entry.path[len(folder) + 1 :].replace(os.sep, "/"),
-            entry.path,
-            stamp_of(entry),
-        )
-        for folder in folders
-        for entry in files_below(
-            folder, lambda name: name == BYTECODE or name.startswith(".")
-        )
-    ]
-    if (
-        not folders
-        and spec.origin is not None
-        and (module := Path(spec.origin)).is_file()
-    ):
-        files = [(module.name, spec.origin, stamp_of(module))]
+    for folder in spec.submodule_search_locations or ():
+        for entry in files_below(folder, _is_no_source):
+            name = entry.path[len(folder) + 1 :].replace(os.sep, "/")
+            files.append((name, entry.path, stamp_of(entry)))
+    module = Path(spec.origin or "")
+    if not spec.submodule_search_locations and module.is_file():
+        files.append((module.name, str(module), stamp_of(module)))
     return content_hash(tuple(sorted(files)))[:DIGITS] if files else ""
+
+
+def _is_no_source(name: str) -> bool:
+    return name == BYTECODE or name.startswith(".")

@@ -55,11 +55,8 @@ class RecordedRun:
     @property
     def contestant(self) -> str:
         """Estimator, with the variant unless it is the default one."""
-        return (
-            self.estimator
-            if self.variant in DEFAULT_VARIANT
-            else f"{self.estimator}/{self.variant}"
-        )
+        own = "" if self.variant in DEFAULT_VARIANT else f"/{self.variant}"
+        return f"{self.estimator}{own}"
 
     @property
     def ended(self) -> bool:
@@ -150,12 +147,11 @@ class RecordedBatch:
 
         `ALL_LOGS` gives those of every log. Logs on which either cannot have the score have no pairs.
         """
-        # all logs together are pooled by seed
-        logs = self.logs if log == ALL_LOGS else [log]
-        both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
-        values = np.array(
-            [(own.value(key), other.value(key)) for own, other in both]
-        ).reshape(-1, 2)
+        both = [
+            (own.value(key), reference.value(key))
+            for own, reference in self._pairs(log, contestant, key)
+        ]
+        values = np.array(both).reshape(-1, 2)
         return values[:, 0], values[:, 1]
 
     def cases(self, log: str, contestant: str, key: str) -> list[str | int]:
@@ -163,24 +159,24 @@ class RecordedBatch:
 
         Pairs with one seed on several logs depend on each other: worlds of a grid share the draws of the seed.
         """
-        logs = self.logs if log == ALL_LOGS else [log]
-        runs = [own for one in logs for own, _ in self._pairs_on(one, contestant, key)]
+        runs = [own for own, _ in self._pairs(log, contestant, key)]
         return [run.log if run.seed is None else run.seed for run in runs]
 
-    def _pairs_on(
+    def _pairs(
         self, log: str, contestant: str, key: str
     ) -> list[tuple[RecordedRun, RecordedRun]]:
-        if not all(
-            self.is_asked(log, name, key) for name in (contestant, self.reference)
-        ):
-            return []
-        # the same seed draws the same world for both
-        reference = {run.seed: run for run in self.group(log, self.reference)}
-        return [
-            (run, reference[run.seed])
-            for run in self.group(log, contestant)
-            if run.seed in reference
-        ]
+        pairs = []
+        # all logs together are pooled by seed
+        for one in self.logs if log == ALL_LOGS else [log]:
+            contestants = contestant, self.reference
+            if all(self.is_asked(one, name, key) for name in contestants):
+                # the same seed draws the same world for both
+                reference = {run.seed: run for run in self.group(one, self.reference)}
+                runs = self.group(one, contestant)
+                pairs += [
+                    (run, reference[run.seed]) for run in runs if run.seed in reference
+                ]
+        return pairs
 
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
         """True if a score can be expected: some contestant has it on this log, and this contestant on some log.
@@ -221,14 +217,11 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
         When there are no results, no run was done yet, the table lacks a column, or the reference is not planned.
     """
     path = folder / RESULTS
-    if not path.is_file() and is_batch(folder):
-        raise EvaluationError(
-            f"{folder}: no {RESULTS} in it: the batch was ended before any of its runs was done; {GOING_ON}"
-        )
     if not path.is_file():
-        raise EvaluationError(
-            f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to"
-        )
+        why = "; it needs a folder that bench wrote to"
+        if is_batch(folder):
+            why = f": the batch was ended before any of its runs was done; {GOING_ON}"
+        raise EvaluationError(f"{folder}: no {RESULTS} in it{why}")
     try:
         # loaded here, because a comparison needs no extra
         import pyarrow as pa  # of the extra `bench`

@@ -19,7 +19,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.diagnosis import compared, trusted
 from sonar_graph.files import regular
 from sonar_graph.logs import PartialCalibration, read_log
-from sonar_graph.logs.adapters import LogConfig, read_log_config
+from sonar_graph.logs.adapters import as_log_config
 from sonar_graph.logs.convert import (
     read_akit,
     read_dlr,
@@ -94,28 +94,13 @@ class SourceKind:
     """Quick check that raises for options which are valid one by one but not together."""
 
 
-def _parsed(
-    options: LogOptions,
-) -> tuple[PartialCalibration | None, LogConfig | None, TimeWindow]:
-    return (
-        None
-        if options.calibration is None
-        else PartialCalibration.read(Path(options.calibration)),
-        None
-        if options.log_config is None
-        else read_log_config(Path(options.log_config)),
-        TimeWindow.parse(options.start, options.end),
-    )
-
-
 def _read_log(options: LogOptions) -> Sequence:
-    given, config, window = _parsed(options)
     sequence = read_log(
-        Path(options.log),
-        calibration=given,
+        options.log,
+        calibration=options.calibration,
         topics=options.topics,
-        config=config,
-        window=window,
+        config=options.log_config,
+        window=TimeWindow.parse(options.start, options.end),
         salvage=options.salvage,
     )
     return sequence if options.map is None else in_map(sequence, Path(options.map))
@@ -125,7 +110,10 @@ def _check_log(options: LogOptions) -> None:
     """Raise for a file that is no log, and for options about it that cannot be understood."""
     for part in log_parts(Path(options.log)):
         LogFile(part).close()
-    _parsed(options)
+    if options.calibration is not None:
+        PartialCalibration.read(Path(options.calibration))
+    as_log_config(options.log_config, "read_log")
+    TimeWindow.parse(options.start, options.end)
     if options.map is not None:
         read_map(Path(options.map))
 
@@ -174,19 +162,16 @@ def read_source(
     source = KINDS[kind]
     values = options | {"seed": seed} if kind in GENERATORS else options
     sequence = source.read(source.options.model_validate(values))
-    return (
-        sequence
-        if landmarks is None
-        else add_landmarks(sequence, LandmarkOptions(**(landmarks | {"seed": seed})))
-    )
+    if landmarks is None:
+        return sequence
+    return add_landmarks(sequence, LandmarkOptions(**(landmarks | {"seed": seed})))
 
 
 def with_findings(kind: str, options: dict[str, Any], sequence: Sequence) -> Sequence:
     """The sequence of a log with notes of what its sensors contradict; simulators and data sets are known."""
     if kind != LOG:
         return trusted(sequence)
-    _, config, _ = _parsed(LogOptions.model_validate(options))
-    return compared(sequence, config)
+    return compared(sequence, as_log_config(options.get("log_config"), "read_log"))
 
 
 def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -203,17 +188,13 @@ def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
 
 def _hash(path: Path) -> str:
     """SHA-256 of a file, or of all names and files below a folder; read again only if stamps changed."""
-    files = (
-        sorted(Path(entry.path) for entry in files_below(str(path)))
-        if path.is_dir()
-        else [path]
-    )
-    return content_hash(
-        tuple(
-            (file.relative_to(path).as_posix(), str(file), stamp_of(file))
-            for file in files
-        )
-    )
+    files = [path]
+    if path.is_dir():
+        files = sorted(Path(entry.path) for entry in files_below(str(path)))
+    named = [
+        (file.relative_to(path).as_posix(), str(file), stamp_of(file)) for file in files
+    ]
+    return content_hash(tuple(named))
 
 
 @lru_cache

@@ -243,9 +243,7 @@ def paired(
     lost = np.isinf(own) | np.isinf(reference)
     both = np.isinf(own) & np.isinf(reference)
     # two runs without a value are equal, but inf - inf is NaN
-    differences = np.where(
-        both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference)
-    )
+    differences = np.where(both, 0.0, own) - np.where(both, 0.0, reference)
     each = "pair"
     if cases is not None:
         # fromkeys: each case once, in the order of its first pair
@@ -300,9 +298,8 @@ def mean_interval(values: Floats) -> tuple[float, float]:
         return mean, mean
     skewness = float((((values - mean) / values.std()) ** 3).mean())
     bound = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1)) / math.sqrt(n)
-    return mean - deviation * _unskewed(
-        bound, skewness, n
-    ), mean - deviation * _unskewed(-bound, skewness, n)
+    low, high = (_unskewed(side * bound, skewness, n) for side in (1, -1))
+    return mean - deviation * low, mean - deviation * high
 
 
 def _unskewed(bound: float, skewness: float, n: int) -> float:
@@ -349,11 +346,10 @@ def anees(nees: Floats, dof: float) -> Anees:
     >>> round(found.mean, 2), found.verdict
     (1.06, 'consistent')
     """
-    if not len(nees) or np.isinf(nees).any():
-        return Anees(len(nees), math.nan, (math.nan, math.nan))
-    band = (
-        (math.nan, math.nan)
-        if math.isnan(dof)
-        else anees_interval(len(nees), int(dof), CONFIDENCE)
-    )
-    return Anees(len(nees), float(nees.mean()), band)
+    n = len(nees)
+    band = math.nan, math.nan
+    if not n or np.isinf(nees).any():
+        return Anees(n, math.nan, band)
+    if not math.isnan(dof):
+        band = anees_interval(n, int(dof), CONFIDENCE)
+    return Anees(n, float(nees.mean()), band)

@@ -126,13 +126,7 @@ class LogEntry(Section):
 
     @model_validator(mode="after")
     def _check(self) -> LogEntry:
-        if (
-            sum(
-                source is not None
-                for source in (self.log, self.dataset, self.generator)
-            )
-            != 1
-        ):
+        if [self.log, self.dataset, self.generator].count(None) != 2:
             raise ValueError("expected exactly one of log, dataset and generator")
         if self.landmarks is not None and self.generator is not None:
             raise ValueError(
@@ -153,13 +147,9 @@ class LogEntry(Section):
         """Seeds to run; one None if nothing is random."""
         if self.generator is None and self.landmarks is None:
             return [None]
-        return (
-            list(range(self.seeds))
-            if isinstance(self.seeds, int)
-            else [0]
-            if self.seeds is None
-            else [*self.seeds]
-        )
+        if isinstance(self.seeds, int):
+            return list(range(self.seeds))
+        return [0] if self.seeds is None else [*self.seeds]
 
 
 class EstimatorEntry(Section):
@@ -213,35 +203,29 @@ class SuiteFile:
 
     def holds(self, name: str) -> bool:
         """True if a file or folder is where `find` looks for it."""
-        return any((root / name).exists() for root in self._roots())
+        return bool(self._found(name))
 
     def find(self, place: Place, name: str) -> str:
         """Absolute path of a file or folder, relative to the suite's folder or else to the folder of data sets.
 
         Raises `BatchError` when it is in neither.
         """
-        # files beside the suite go before those of a folder for all suites
-        roots = self._roots()
-        found = [root / name for root in roots if (root / name).exists()]
+        found = self._found(name)
         if not found:
-            looked = " or ".join(str(root.resolve()) for root in roots)
-            more = (
-                ""
-                if len(roots) > 1
-                else f"; {DATA_VARIABLE} can name another folder to look in"
-            )
+            looked = " or ".join(str(root.resolve()) for root in self._roots())
+            more = f"; {DATA_VARIABLE} can name another folder to look in"
+            if len(self._roots()) > 1:
+                more = ""
             self.refuse(place, f"{name} is not in {looked}{more}")
+        # files beside the suite go before those of a folder for all suites
         return str(found[0].resolve())
 
+    def _found(self, name: str) -> list[Path]:
+        return [root / name for root in self._roots() if (root / name).exists()]
+
     def _roots(self) -> list[Path]:
-        return [
-            self.path.parent,
-            *(
-                [Path(os.environ[DATA_VARIABLE])]
-                if os.environ.get(DATA_VARIABLE)
-                else []
-            ),
-        ]
+        data = os.environ.get(DATA_VARIABLE)
+        return [self.path.parent, *([Path(data)] if data else [])]
 
 
 def read_suite(path: Path) -> SuiteFile:

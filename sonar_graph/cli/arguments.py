@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -157,21 +158,18 @@ class ReadingOptions:
     @property
     def config(self) -> LogConfig | None:
         """Description of the log's topics from a TOML file, if one is given."""
-        from sonar_graph.logs.adapters import read_log_config
+        from sonar_graph.logs.adapters import as_log_config
 
         # without a description the topics are chosen by their types
-        return None if self.log_config is None else read_log_config(self.log_config)
+        return as_log_config(self.log_config, "inspect_log")
 
     @property
     def given(self) -> PartialCalibration | None:
         """Fields of a calibration from a file, if one is given."""
         from sonar_graph.logs import PartialCalibration
 
-        return (
-            None
-            if self.calibration is None
-            else PartialCalibration.read(self.calibration)
-        )
+        given = self.calibration
+        return None if given is None else PartialCalibration.read(given)
 
     @property
     def window(self) -> TimeWindow:
@@ -226,36 +224,29 @@ def with_options(
         groups: dict[str, Any] = {
             name: kind for name, kind in hints.items() if is_dataclass(kind)
         }
-        offered = {
-            name: [f for f in fields(kind) if f.name not in left_out]
-            for name, kind in groups.items()
-        }
 
         @wraps(command)
         def run(**values: Any) -> None:
             for name, kind in groups.items():
                 # fields that the command does not offer keep their defaults
-                values[name] = kind(
-                    **{f.name: values.pop(f.name) for f in offered[name]}
-                )
+                given = {f.name for f in fields(kind)} & values.keys()
+                values[name] = kind(**{key: values.pop(key) for key in given})
             command(**values)
 
         parameters = []
         for name, parameter in signature(command).parameters.items():
+            offered = [(name, parameter.default, hints[name])]
             if name in groups:
                 kinds = get_type_hints(groups[name], include_extras=True)
-                given = [(f.name, f.default, kinds[f.name]) for f in offered[name]]
-            else:
-                given = [(name, parameter.default, hints[name])]
+                shown = [f for f in fields(groups[name]) if f.name not in left_out]
+                offered = [(f.name, f.default, kinds[f.name]) for f in shown]
             parameters += [
-                Parameter(n, Parameter.KEYWORD_ONLY, default=d, annotation=kind)
-                for n, d, kind in given
+                Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+                for key, default, kind in offered
             ]
         # typer must see the options, and `wraps` has copied the command's own signature
         run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {
-            parameter.name: parameter.annotation for parameter in parameters
-        }
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
         return run
 
     return expand
@@ -272,11 +263,9 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
         parsed: Any = value
         # several lines of TOML could set other names too
         if "\n" not in value:
-            try:
-                # TOML gives numbers, lists and booleans their types
+            # TOML gives numbers, lists and booleans their types
+            with suppress(tomllib.TOMLDecodeError):
                 parsed = tomllib.loads(f"value = {value}")["value"]
-            except tomllib.TOMLDecodeError:
-                parsed = value
         if name in settings and settings[name] != parsed:
             raise EstimatorError(
                 f"--set {text}: {name} is also set to {settings[name]}; give it once"
@@ -372,8 +361,6 @@ def answers() -> Console:
     """Console for results on stdout; if that is no terminal, it is `FILE_WIDTH` wide."""
     # numbers and paths keep the colour of the text around them
     console = PlainConsole(highlight=False)
-    return (
-        console
-        if console.is_terminal
-        else PlainConsole(highlight=False, width=FILE_WIDTH)
-    )
+    if not console.is_terminal:
+        console.width = FILE_WIDTH
+    return console

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -196,11 +196,8 @@ def figures(
         working("drawing"),
         writable_folder(target, [], kind=PAPER, overwrite=overwrite),
     ):
-        document = write_paper(
-            read_batch(folder) if is_batch(folder) else read_comparison(folder),
-            target,
-            overwrite=overwrite,
-        )
+        read = read_batch if is_batch(folder) else read_comparison
+        document = write_paper(read(folder), target, overwrite=overwrite)
     echo(f"Figures and tables: {document}")
 
 
@@ -235,16 +232,11 @@ def demo(
         with writable_folder(output, names_written(output, names), overwrite=overwrite):
             # the simulator has made the sensors as they are calibrated: to compare them would take as long as
             # to recognise the landmarks
-            prepared = prepared_log(
-                log,
-                ReadingOptions(),
-                RecogniserOptions(),
-                DEFAULT_RATE_HZ,
-                are_sensors_trusted=True,
-            )
+            options_left = ReadingOptions(), RecogniserOptions()
+            prepared = prepared_log(log, *options_left, are_sensors_trusted=True)
             with working("compiling the estimators for the first use"):
                 wait_until_compiled()
-            comparison = compare_prepared(prepared, names, {})
+            comparison = compare_prepared(*prepared, names, {}, DEFAULT_RATE_HZ)
             with working("writing results"):
                 page = write_report(comparison, output)
     print_outcome(comparison, f"Report: {page}")
@@ -279,11 +271,7 @@ def estimators() -> None:
         )
         table = Table("setting", "default", "meaning", box=None, pad_edge=True)
         for setting in settings_of(settings):
-            table.add_row(
-                escape(setting.name),
-                escape(str(setting.default)),
-                escape(setting.meaning),
-            )
+            table.add_row(*(escape(str(part)) for part in setting))
         console.print(table if settings.model_fields else "  no settings")
         console.print()
     if failed:
@@ -331,36 +319,26 @@ def compared(
     )
     written = names_written(output, names)
     with writable_folder(output, written, sources, overwrite=estimation.overwrite):
-        prepared = prepared_log(log, reading, recognition, estimation.rate_hz)
-        yield compare_prepared(prepared, names, overrides)
-
-
-class PreparedLog(NamedTuple):
-    """A log as estimators get it."""
-
-    sequence: Sequence
-    recognition: Recognition | None
-    """None where the log had detections, or no images."""
-    rate_hz: float
-    """Estimates a second."""
+        prepared = prepared_log(log, reading, recognition)
+        yield compare_prepared(*prepared, names, overrides, estimation.rate_hz)
 
 
 def prepared_log(
     log: Path,
     reading: ReadingOptions,
     recognition: RecogniserOptions,
-    rate_hz: float | None,
     *,
     are_sensors_trusted: bool = False,
-) -> PreparedLog:
-    """Read a log, compare its sensors unless they are trusted, and recognise landmarks if it needs that."""
+) -> tuple[Sequence, Recognition | None]:
+    """Read a log, compare its sensors unless they are trusted, and recognise landmarks if it needs that.
+
+    The recognition is None where the log had detections, or no images.
+    """
     from sonar_graph.diagnosis import compared, trusted
     from sonar_graph.logs import LIVE_RATE, no_images
 
     with progress_bars() as progress:
         sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
-    # the record of a live run gives the estimates of that run only at its rate
-    rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     with working("comparing sensors"):
         sequence = (
             trusted(sequence)
@@ -371,9 +349,8 @@ def prepared_log(
     # what was recognised is in it: estimates are those of the live run
     is_of_live_run = LIVE_RATE in sequence.notes
     if (sequence.detections is None and not is_of_live_run) or recognition.is_given:
-        found = recognise_log(
-            log, sequence, reading, recognition.recogniser(sequence.calibration)
-        )
+        recogniser = recognition.recogniser(sequence.calibration)
+        found = recognise_log(log, sequence, reading, recogniser)
         if found is None and recognition.is_given:
             raise LogError(
                 f"{no_images(log)}; --designs, --model and --rule are for images"
@@ -385,24 +362,27 @@ def prepared_log(
         from sonar_graph.recognition import with_detections
 
         sequence = with_detections(sequence, found)
-    return PreparedLog(sequence, found, rate_hz)
+    return sequence, found
 
 
 def compare_prepared(
-    prepared: PreparedLog, names: list[str], overrides: dict[str, dict[str, Any]]
+    sequence: Sequence,
+    recognition: Recognition | None,
+    names: list[str],
+    overrides: dict[str, dict[str, Any]],
+    rate_hz: float | None,
 ) -> Comparison:
     """Compare estimators on a log that was read, with a progress bar for each."""
     from sonar_graph.evaluation import compare as compare_runs
+    from sonar_graph.logs import LIVE_RATE
 
+    # the record of a live run gives the estimates of that run only at its rate
+    rate_hz = rate_hz or float(sequence.notes.get(LIVE_RATE, DEFAULT_RATE_HZ))
     with progress_bars() as progress:
         comparison = compare_runs(
-            prepared.sequence,
-            names,
-            overrides,
-            rate_hz=prepared.rate_hz,
-            progress=progress,
+            sequence, names, overrides, rate_hz=rate_hz, progress=progress
         )
-    return replace(comparison, recognition=prepared.recognition)
+    return replace(comparison, recognition=recognition)
 
 
 def print_outcome(comparison: Comparison, place: str) -> None:

@@ -167,28 +167,22 @@ def print_summary(
         kind = topic.type_name + (
             f" ({topic.encoding})" if topic.encoding != "cdr" else ""
         )
-        first_s, last_s = (
-            (stamp_ns - origin_ns) * 1e-9
-            for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns)
-        )
-        cells = [
-            topic.name,
-            kind,
+        first_s = (topic.first_stamp_ns - origin_ns) * 1e-9
+        last_s = (topic.last_stamp_ns - origin_ns) * 1e-9
+        topics.add_row(
+            escape(topic.name),
+            escape(kind),
             str(topic.messages),
             f"{topic.rate_hz:.2f}",
             f"{first_s:.1f} to {last_s:.1f}",
-        ]
-        cells += [f"{topic.largest_gap_s:.2f}", f"{1e3 * topic.jitter_s:.2g}"]
-        topics.add_row(
-            *map(escape, [*cells, "-" if topic.lag_s is None else f"{topic.lag_s:.3f}"])
+            f"{topic.largest_gap_s:.2f}",
+            f"{1e3 * topic.jitter_s:.2g}",
+            "-" if topic.lag_s is None else f"{topic.lag_s:.3f}",
         )
     roles = Table("used for", "topic", "because", box=None, pad_edge=False)
     for role in summary.roles:
-        roles.add_row(
-            escape(role.role.replace("_", " ")),
-            escape(role.topic or "-"),
-            escape(role.reason),
-        )
+        cells = role.role.replace("_", " "), role.topic or "-", role.reason
+        roles.add_row(*map(escape, cells))
     console.print(topics, "", roles, "", sep="\n")
     # a table that is cut must not look complete
     if len(summary.topics) > len(shown):
@@ -196,22 +190,20 @@ def print_summary(
             "not shown",
             f"{len(summary.topics) - len(shown)} more topics; --json gives all",
         )
-    say("calibration", summary.calibration)
-    for subject, note in summary.notes.items():
-        say(subject, note)
-    if summary.sonar:
-        say("sonar images", summary.sonar)
-    if skipped:
-        say("sensors", skipped)
-    else:
+    about = [("calibration", summary.calibration), *summary.notes.items()]
+    for subject, note in [
+        *about,
+        ("sonar images", summary.sonar),
+        ("sensors", skipped),
+    ]:
+        if note:
+            say(subject, note)
+    if not skipped:
         console.print("\n[bold]sensors against each other[/] (± 95 %)")
         for finding in findings:
             warned = "warning: " if finding.quantity in grave else ""
-            say(
-                warned + finding.quantity,
-                finding.text(),
-                "bold yellow" if finding.acts else "bold",
-            )
+            style = "bold yellow" if finding.acts else "bold"
+            say(warned + finding.quantity, finding.text(), style)
         console.print()
     for rows in summary.left_out:
         say("left out", rows)
@@ -229,22 +221,17 @@ def print_summary(
     if summary.obstacles:
         lacking = escape(", ".join(summary.obstacles))
         console.print(f"[bold red]not usable for compare[/]: {lacking}", soft_wrap=True)
+        say_it = "Say"
         if summary.has_images_alone:
-            console.print(
-                escape(
-                    f"Its sonar images can be used: sonar-graph recognise {summary.path} -o recognised.mcap; "
-                    f"sonar-graph join {summary.path} NAV -o joined.mcap brings in IMU and Doppler log of another file"
-                ),
-                soft_wrap=True,
+            say_it = "If it has IMU and Doppler log, say"
+            echo(
+                f"Its sonar images can be used: sonar-graph recognise {summary.path} -o recognised.mcap; "
+                f"sonar-graph join {summary.path} NAV -o joined.mcap brings in IMU and Doppler log of another file"
             )
         # the command can be copied as it is
-        hint = escape(f"sonar-graph inspect {summary.path} --toml > log.toml")
-        say_it = (
-            "If it has IMU and Doppler log, say" if summary.has_images_alone else "Say"
-        )
-        console.print(
-            f"{say_it} what its topics are: {hint}, edit it, and give --log-config log.toml",
-            soft_wrap=True,
+        echo(
+            f"{say_it} what its topics are: sonar-graph inspect {summary.path} --toml > log.toml, edit it, and give "
+            "--log-config log.toml"
         )
 
 

@@ -42,13 +42,6 @@ class Seen:
     range_m: float
     """Middle of their window."""
 
-    def count_within(self, sequence: Sequence, shift_ns: int) -> int:
-        """Number of frames with IMU and Doppler log, once their stamps are moved."""
-        return sum(
-            sequence.start_ns <= stamp_ns + shift_ns <= sequence.end_ns
-            for stamp_ns in self.stamps_ns
-        )
-
 
 @dataclass(frozen=True)
 class JoinOptions:
@@ -106,11 +99,15 @@ def join(
         with_notes,
         write_amended,
     )
+    from sonar_graph.logs.mcap import Keep, scan
 
     # neither source may be replaced by the joined log
     path = writable_log(output, images, navigation, overwrite=options.overwrite)
     # before the images are read, which takes minutes
-    refuse_images(navigation)
+    if TOPIC in scan(navigation, lambda _: Keep.NONE).topics:
+        raise LogError(
+            f"{navigation}: has {TOPIC} already; recognise it as it is, or give a log without images"
+        )
     sequence = reading.read(navigation)
     topic = reading.choices.get("sonar")
     alone = read_images_alone(images, topic=topic, salvage=reading.salvage)
@@ -158,23 +155,16 @@ def join(
         )
     echo(f"Clock offset, to be added to the stamps of {images.name}: {said}")
     # frames outside have no motion, and cannot be tracked
-    within = seen.count_within(sequence, shift_ns)
+    within = sum(
+        sequence.start_ns <= stamp_ns + shift_ns <= sequence.end_ns
+        for stamp_ns in seen.stamps_ns
+    )
     echo(
         f"{len(seen.stamps_ns)} frames, {within} of them while IMU and Doppler log measure"
     )
     for note in amended.notes.values():
         echo(f"Not copied: {note}")
     echo(f"Log: {path}\nNext: sonar-graph recognise {path} -o recognised.mcap")
-
-
-def refuse_images(navigation: Path) -> None:
-    """Refuse a navigation that has what would be written."""
-    from sonar_graph.logs.mcap import Keep, scan
-
-    if TOPIC in scan(navigation, lambda _: Keep.NONE).topics:
-        raise LogError(
-            f"{navigation}: has {TOPIC} already; recognise it as it is, or give a log without images"
-        )
 
 
 def look(

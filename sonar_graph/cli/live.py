@@ -339,7 +339,9 @@ class StatusLine:
             return
         # a longer status would wrap, and the next could not replace it
         width = shutil.get_terminal_size().columns
-        echo_status(status[: width - 1])
+        typer.echo("\r\x1b[2K", nl=False)
+        echo(status[: width - 1], nl=False)
+        sys.stdout.flush()
         self._is_shown = True
 
     def say(self, line: str) -> None:
@@ -352,13 +354,6 @@ class StatusLine:
         if self._is_shown:
             typer.echo()
         self._is_shown = False
-
-
-def echo_status(status: str) -> None:
-    """Write a status over the line of the terminal."""
-    typer.echo("\r\x1b[2K", nl=False)
-    echo(status, nl=False)
-    sys.stdout.flush()
 
 
 def wait_for_listener(

@@ -148,14 +148,14 @@ def progress_bars() -> Iterator[Report]:
     """Progress bars, one for each name of work, while the context is open."""
     # stdout is for answers that another program may read
     console = Console(stderr=True)
-    bar = (
+    bars = Progress(
+        TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.fields[remark]}"),
         TimeRemainingColumn(elapsed_when_finished=True),
-    )
-    columns = (TextColumn("{task.description}"), *bar)
-    bars = Progress(
-        *columns, console=console, disable=not console.is_terminal, transient=True
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
     )
     tasks = {}
 

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from sonar_graph.logs.mcap import Outgoing
     from sonar_graph.simulation import BasinOptions
 
+Seed = Annotated[
+    int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
+]
+
 
 @with_options("start", "end", "salvage", "map")
 def landmarks(
@@ -39,9 +43,7 @@ def landmarks(
     ],
     output: OutputLog,
     reading: ReadingOptions,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
-    ] = None,
+    seed: Seed = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -106,9 +108,7 @@ worlds.command(
 class BasinChoices:
     """Options of the basin that the command line names; --set gives any other."""
 
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")
-    ] = None
+    seed: Seed = None
     duration_s: Annotated[
         float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")
     ] = None
@@ -136,13 +136,10 @@ class BasinChoices:
         """Options for the simulator; a setting of --set goes before the option of the same name."""
         from sonar_graph.simulation import BasinOptions
 
-        flags = {
-            "seed": self.seed,
-            "duration_s": self.duration_s,
-            "laps": self.laps,
-        }
         values: dict[str, Any] = {
-            name: value for name, value in flags.items() if value is not None
+            name: getattr(self, name)
+            for name in ("seed", "duration_s", "laps")
+            if getattr(self, name) is not None
         }
         # a setting may name anything, and goes before the option of its name
         given = nested_settings(self.settings)

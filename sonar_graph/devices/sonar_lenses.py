@@ -16,60 +16,43 @@ _DIDSON_POLYNOMIALS = {
 """Beam number from 1 minus 1, as a polynomial of the angle to the right in degrees, constant first."""
 DIDSON_BEAMS = tuple(_DIDSON_POLYNOMIALS)
 """Numbers of beams that a DIDSON has."""
-_Table = tuple[int, tuple[tuple[int, float], ...]]
+_Table = tuple[int, tuple[int, ...], tuple[float, ...]]
 _ARIS_TABLES: dict[tuple[int, bool], _Table] = {
     (48, False): (
         3,
-        (
-            (0, -13.5735),
-            (4, -11.7721),
-            (8, -9.7597),
-            (12, -7.5026),
-            (16, -5.0291),
-            (20, -2.3931),
-            (23, -0.3461),
-        ),
+        (*range(0, 24, 4), 23),
+        (13.5735, 11.7721, 9.7597, 7.5026, 5.0291, 2.3931, 0.3461),
     ),
     (96, False): (
         3,
+        (*range(0, 96, 8), 95),
         (
-            *(
-                (0, -13.749),
-                (8, -11.9476),
-                (16, -9.9352),
-                (24, -7.6781),
-                (32, -5.2046),
-                (40, -2.5686),
-                (48, 0.1706),
-            ),
-            *(
-                (56, 2.9098),
-                (64, 5.5458),
-                (72, 8.0193),
-                (80, 10.2764),
-                (88, 12.2888),
-                (95, 13.8759),
-            ),
+            13.749,
+            11.9476,
+            9.9352,
+            7.6781,
+            5.2046,
+            2.5686,
+            -0.1706,
+            -2.9098,
+            -5.5458,
+            -8.0193,
+            -10.2764,
+            -12.2888,
+            -13.8759,
         ),
     ),
-    (64, False): (1, ((0, -14.703), (4, -12.951), (28, -1.738), (31, -0.249))),
-    (128, False): (1, ((0, -14.705), (8, -12.967), (56, -1.846), (63, -0.123))),
-    (48, True): (1, ((0, -6.742), (6, -5.126), (18, -1.680), (23, -0.154))),
+    (64, False): (1, (0, 4, 28, 31), (14.703, 12.951, 1.738, 0.249)),
+    (128, False): (1, (0, 8, 56, 63), (14.705, 12.967, 1.846, 0.123)),
+    (48, True): (1, (0, 6, 18, 23), (6.742, 5.126, 1.680, 0.154)),
     (96, True): (
         3,
-        (
-            (0, -7.419),
-            (8, -6.220),
-            (16, -4.993),
-            (24, -3.739),
-            (32, -2.471),
-            (40, -1.199),
-            (47, -0.080),
-        ),
+        (*range(0, 48, 8), 47),
+        (7.419, 6.220, 4.993, 3.739, 2.471, 1.199, 0.080),
     ),
 }
-"""By number of beams and whether the telephoto lens is fitted: degree of the spline, and beams from the left with their
-angle to the right in degrees; a table that ends in the middle is continued antisymmetrically."""
+"""By number of beams and whether the telephoto lens is fitted: degree of the spline, beams from the left, and their angles
+to the left in degrees; a table that ends in the middle is continued antisymmetrically."""
 
 
 def even_azimuths(beams: int, half_angle_deg: float) -> Floats:
@@ -124,11 +107,11 @@ def aris_azimuths(beams: int, *, telephoto: bool) -> Floats | None:
     """
     if (beams, telephoto) not in _ARIS_TABLES:
         return None
-    degree, rows = _ARIS_TABLES[beams, telephoto]
-    number, angle_deg = np.array(rows).T
+    degree, *rows = _ARIS_TABLES[beams, telephoto]
+    number, angle_deg = np.array(rows)
     if number[-1] < beams - 1:
         # the lens is symmetric about its middle
         number = np.concatenate([number, beams - 1 - number[::-1]])
         angle_deg = np.concatenate([angle_deg, -angle_deg[::-1]])
     from_left_deg = make_interp_spline(number, angle_deg, k=degree)(np.arange(beams))
-    return np.radians(-from_left_deg[::-1])
+    return np.radians(from_left_deg[::-1])

@@ -19,8 +19,8 @@ _Signal = tuple[int, FrameType | None]
 @contextmanager
 def _handling(
     handle: Callable[[_Signal, Callable[[], object]], object],
-) -> Iterator[bool]:
-    """Give each Ctrl-C of the block to ``handle``, with what would have been done; False where that is not possible.
+) -> Iterator[None]:
+    """Give each Ctrl-C of the block to ``handle``, with what would have been done.
 
     Only the main thread has handlers, and one of another program's C code stays. A Ctrl-C that comes while numba makes
     Python objects of its results is sent again, and comes after them.
@@ -29,7 +29,7 @@ def _handling(
     if threading.current_thread() is not threading.main_thread() or not callable(
         before
     ):
-        yield False
+        yield
         return
     usual: Callable[[int, FrameType | None], object] = before
 
@@ -41,7 +41,7 @@ def _handling(
 
     signal.signal(signal.SIGINT, interrupt)
     try:
-        yield True
+        yield
     finally:
         signal.signal(signal.SIGINT, before)
 

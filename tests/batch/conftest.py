@@ -90,19 +90,15 @@ def misbehaving(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def planned(write_suite) -> Callable[..., PlannedRun]:
+def planned(plan) -> Callable[..., PlannedRun]:
     """The one run of a suite with a named estimator."""
 
-    def plan(name: str = "dead-reckoning") -> PlannedRun:
-        suite = write_suite(
-            HEADER.replace("dead-reckoning", name),
-            BASIN,
-            f'[[estimators]]\nname = "{name}"\n',
-        )
-        (run,) = plan_runs(read_suite(suite))
+    def of(name: str = "dead-reckoning") -> PlannedRun:
+        header = HEADER.replace("dead-reckoning", name)
+        (run,) = plan(header, BASIN, f'[[estimators]]\nname = "{name}"\n')
         return run
 
-    return plan
+    return of
 
 
 @pytest.fixture
@@ -115,3 +111,9 @@ def write_suite(tmp_path) -> WriteSuite:
         return path
 
     return write
+
+
+@pytest.fixture
+def plan(write_suite) -> Callable[..., list[PlannedRun]]:
+    """The runs of a suite, from its parts."""
+    return lambda *parts: plan_runs(read_suite(write_suite(*parts)))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import regression_gate
 from regression_gate import GateVerdict, bless, gate
 
 from sonar_graph.batch import RecordedBatch
@@ -16,6 +17,7 @@ from tests.recorded_batches import (
     updated,
     with_failures,
     without,
+    written_batch,
 )
 
 ATE = "causal.ate_se2_m"
@@ -118,3 +120,35 @@ def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_p
         entry["scores"]["time.total_s"] = run.values["time.total_s"]
     path.write_text(json.dumps(content))
     assert gate(slower(batch, 4.0), path).passed
+
+
+def script(*words: object) -> int:
+    return regression_gate.main([str(word) for word in words])
+
+
+def test_the_script_passes_a_batch_by_its_own_reference(tmp_path, capsys):
+    reference = tmp_path / "reference.json"
+    folder = written_batch(tmp_path / "batch")
+    assert script("bless", folder, reference) == 0
+    content = json.loads(reference.read_text("utf-8"))
+    assert content["format"] == "sonar_graph batch reference 2"
+    assert script("judge", folder, reference) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"Reference: {reference} (16 runs, 0 of which did not end)",
+        "Hardly different from the reference: dead-reckoning, isam2",
+        f"Gate: passed, 16 runs held against {reference}",
+    ]
+    assert script("judge", written_batch(tmp_path / "worse", 1.5), reference) == 1
+    said = capsys.readouterr().out
+    for line in (
+        "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 cases, p = 0.0039 (of the whole batch)",
+        "Gate: failed",
+        "Would have been found in four of five batches: one error larger on all logs by about",
+        "Hardly different from the reference: dead-reckoning",
+    ):
+        assert line in said
+    content["runs"][0]["asked"]["settings"] = {"lag_s": 1.0}
+    reference.write_text(json.dumps(content))
+    assert script("judge", folder, reference) == 2
+    told = "seed 0: settings.lag_s is not given, in the reference 1.0; these are"
+    assert told in capsys.readouterr().err

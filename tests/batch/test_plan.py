@@ -2,37 +2,23 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch import plan_runs, read_suite
 from sonar_graph.batch.plan import source_hash, versions_of
 from sonar_graph.batch.sources import LOG, fingerprint
-from sonar_graph.batch.store import PlannedRun
 from sonar_graph.errors import BatchError
 
-from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 ISAM2 = '[[estimators]]\nname = "isam2"\n'
 HEADER_OF_ISAM2 = HEADER.replace("dead-reckoning", "isam2")
 
 
-def planned(write_suite: WriteSuite, *parts: str) -> list[PlannedRun]:
-    return plan_runs(read_suite(write_suite(*parts)))
-
-
-def key(write_suite: WriteSuite, *parts: str) -> str:
-    (run,) = planned(write_suite, *parts)
-    return run.key
-
-
-def test_every_combination_is_planned_once_in_order(write_suite):
-    runs = planned(
-        write_suite,
+def test_every_combination_is_planned_once_in_order(plan):
+    runs = plan(
         HEADER,
         BASIN,
         "grid = { wrong_id_rate = [0.0, 0.1], frame_rate_hz = [1, 2] }\nseeds = 2\n",
@@ -75,15 +61,14 @@ OTHERS = {
 
 
 def test_a_run_s_key_changes_with_all_that_decides_its_numbers(
-    write_suite,
+    plan,
 ):
-    (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
+    (run,) = plan(HEADER_OF_ISAM2, BASIN, ISAM2)
     assert run.content == fingerprint(run.kind, run.options)
     assert len(
-        {run.key, *(key(write_suite, *parts) for parts in OTHERS.values())}
+        {run.key, *(plan(*parts)[0].key for parts in OTHERS.values())}
     ) == 1 + len(OTHERS)
-    same = key(
-        write_suite,
+    same = plan(
         HEADER_OF_ISAM2.replace("short", "another") + "timeout_s = 9\n",
         BASIN.replace('"basin"\ngen', '"pool"\ngen').replace(
             "laps = 1", "laps = 1, wrong_id_rate = 0.0"
@@ -91,21 +76,20 @@ def test_a_run_s_key_changes_with_all_that_decides_its_numbers(
         "seeds = [0]\n",
         ISAM2,
         "params = { smoother.lag_s = 15.0 }\n",
-    )
+    )[0].key
     assert same == run.key
 
 
 def test_a_run_s_key_changes_with_class_and_python_version(
-    write_suite, misbehaving, tmp_path, monkeypatch
+    plan, misbehaving, tmp_path, monkeypatch
 ):
     def anew() -> str:
         versions_of.cache_clear()
-        return key(
-            write_suite,
+        return plan(
             HEADER.replace("dead-reckoning", "dies"),
             BASIN,
             '[[estimators]]\nname = "dies"\n',
-        )
+        )[0].key
 
     keys = [anew()]
     points = tmp_path / "site" / "misbehaving-1.0.dist-info" / "entry_points.txt"
@@ -153,7 +137,7 @@ def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
 
 
 def test_an_estimator_of_another_package_has_the_hash_of_that_package(
-    write_suite, misbehaving
+    plan, misbehaving
 ):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
     assert (
@@ -162,23 +146,14 @@ def test_an_estimator_of_another_package_has_the_hash_of_that_package(
         == source_hash("sonar_graph")
     )
     broken = '[[estimators]]\nname = "broken"\nparams = { a = 1 }\n'
-    _, run = planned(write_suite, HEADER, BASIN, DEAD_RECKONING, broken)
+    _, run = plan(HEADER, BASIN, DEAD_RECKONING, broken)
     assert (run.params, run.versions["estimator_source"]) == ({"a": 1}, "")
 
 
-def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite):
-    text = 'params = { identity.policy = "max-mixture" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
-    with pytest.raises(
-        BatchError,
-        match=r'line 11: estimators\.0\.grid\.history: .*"max-mixture", which chooses anew',
-    ):
-        planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
-
-
-def test_the_request_is_the_suite_with_files_by_content(write_suite, tmp_path):
+def test_the_request_is_the_suite_with_files_by_content(plan, tmp_path):
     grid = "grid = { wrong_id_rate = [0.1] }\n"
     params = "params = { smoother.lag_s = 14 }\n"
-    (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
+    (run,) = plan(HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
     assert run.asked == {
         "generator": "basin",
         "options": {"duration_s": 120, "laps": 1, "wrong_id_rate": 0.1},
@@ -187,15 +162,13 @@ def test_the_request_is_the_suite_with_files_by_content(write_suite, tmp_path):
         "settings": {"smoother": {"lag_s": 14}},
         "rate_hz": 2.0,
     }
-    (run,) = planned(
-        write_suite, HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING
-    )
+    (run,) = plan(HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING)
     assert run.asked["files"] == {"file": fingerprint("victoria-park", {})["file"]}
     assert run.asked["landmarks"] == {"frame_rate_hz": 3}
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "Robot1.dat").write_text("1\n")
     robots = '[[logs]]\nname = "x"\ndataset = "mrclam"\noptions = { folder = "robots", robot = 1 }\n'
-    (run,) = planned(write_suite, HEADER, robots, DEAD_RECKONING)
+    (run,) = plan(HEADER, robots, DEAD_RECKONING)
     assert run.asked["options"] == {"robot": 1}
     assert len(run.asked["files"]["folder"]) == 64
 
@@ -271,60 +244,19 @@ def test_a_hash_is_taken_once_in_a_process(package, hashed):
     assert hashed() != before
 
 
-@pytest.mark.slow
-def test_key_changes_with_a_changed_checkout(write_suite, tmp_path):
-    """Another process has a copy of the package in which one comment was added, under the same version."""
-    import baselines
-    import sonar_graph
-
-    for package in (sonar_graph, baselines):
-        folder = Path(str(package.__file__)).parent
-        shutil.copytree(
-            folder,
-            tmp_path / "copy" / folder.name,
-            ignore=shutil.ignore_patterns("__pycache__"),
-        )
-    suite = write_suite(
-        HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "isam2"\n'
-    )
-    here = [run.key for run in plan_runs(read_suite(suite))]
-    assert keys_by(tmp_path / "copy", suite) == here
-    with (tmp_path / "copy" / "baselines" / "dead_reckoning.py").open("a") as file:
-        file.write("# another\n")
-    of_baselines = keys_by(tmp_path / "copy", suite)
-    assert of_baselines[0] != here[0]
-    assert of_baselines[1] == here[1]
-    with (tmp_path / "copy" / "sonar_graph" / "states.py").open("a") as file:
-        file.write("# another\n")
-    assert not {*here, *of_baselines} & set(keys_by(tmp_path / "copy", suite))
-
-
-def keys_by(code: Path, suite: Path) -> list[str]:
-    """Keys as the package in a folder plans them."""
-    program = (
-        f"import sys; sys.path.insert(0, {str(code)!r})\n"
-        "from pathlib import Path; from sonar_graph.batch import plan; from sonar_graph.batch.suite import read_suite\n"
-        f"assert plan.__file__.startswith({str(code)!r})\n"
-        f"print(*(run.key for run in plan.plan_runs(read_suite(Path({str(suite)!r})))))"
-    )
-    return subprocess.run(
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True
-    ).stdout.split()
-
-
 ABSENT = '[[logs]]\nname = "x"\ndataset = "dlr"\noptions = { folder = "absent" }\n'
 
 
 def test_an_absent_log_is_left_out_if_the_suite_states_its_source(
-    write_suite,
+    plan,
 ):
     obtain = 'obtain = "the data set from its authors"\n'
-    runs = planned(write_suite, HEADER, BASIN, ABSENT, obtain, DEAD_RECKONING)
+    runs = plan(HEADER, BASIN, ABSENT, obtain, DEAD_RECKONING)
     assert [run.log for run in runs] == ["basin"]
     with pytest.raises(BatchError, match="absent is not in"):
-        planned(write_suite, HEADER, BASIN, ABSENT, DEAD_RECKONING)
+        plan(HEADER, BASIN, ABSENT, DEAD_RECKONING)
     with pytest.raises(
         BatchError,
         match="no data of any log is here; get the data set from its authors",
     ):
-        planned(write_suite, HEADER, ABSENT, obtain, DEAD_RECKONING)
+        plan(HEADER, ABSENT, obtain, DEAD_RECKONING)

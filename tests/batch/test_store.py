@@ -1,5 +1,6 @@
 """Runs are kept whole or not at all, and nothing else is removed with them."""
 
+import contextlib
 import errno
 import os
 from pathlib import Path
@@ -9,16 +10,13 @@ import pytest
 
 from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.errors import BatchError
+from tests.dying import Died, dies_after
 
 OUTCOME = RunOutcome(
     {"status": "ok", "causal.ate_raw_m": 0.1},
     {"runs/isam2/series.npz": b"123", "a.json": b"{}"},
     "said",
 )
-
-
-class Died(BaseException):
-    """Ends a process."""
 
 
 def names(folder: Path) -> list[str]:
@@ -74,45 +72,23 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
     assert not list((tmp_path / "runs").glob(".*"))
 
 
-def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch):
-    store = Store(tmp_path)
-
-    def die(_self: Path, _target: Path) -> None:
-        raise Died
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", die)
-        # a killed process cleans nothing up
-        patch.setattr("sonar_graph.batch.store.remove_written", lambda _: None)
-        with pytest.raises(Died):
-            store.write("k", OUTCOME)
-    assert store.row("k") is None
-    assert list((tmp_path / "runs").iterdir())
-    store.remove_partial()
-    assert not list((tmp_path / "runs").iterdir())
-
-
 @pytest.mark.parametrize("act", ["discard", "write"])
-def test_a_process_killed_during_removal_leaves_a_run_whole_or_gone(
-    tmp_path, monkeypatch, act
+@pytest.mark.parametrize("steps", range(40))
+def test_a_process_that_dies_leaves_a_run_whole_or_gone(
+    tmp_path, monkeypatch, act, steps
 ):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
-    whole = names(store.run_folder("k"))
-
-    def die(folder: Path, **_options: Any) -> None:
-        next(path for path in folder.rglob("*.npz")).unlink()
-        raise Died
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sonar_graph.batch.store.remove_written", die)
-        with pytest.raises(Died):
-            store.discard("k") if act == "discard" else store.write("k", OUTCOME)
-    assert (store.row("k") is None) == (not store.run_folder("k").exists())
-    assert not store.run_folder("k").exists() or names(store.run_folder("k")) == whole
+    whole = names(tmp_path)
+    with monkeypatch.context() as patch, contextlib.suppress(Died):
+        dies_after(steps, patch)
+        store.discard("k") if act == "discard" else store.write("k", OUTCOME)
+    is_whole = store.run_folder("k").exists()
+    assert store.row("k") == (OUTCOME.row if is_whole else None)
     store.remove_partial()
+    assert names(tmp_path) == (whole if is_whole else [])
     store.write("k", OUTCOME)
-    assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
+    assert names(tmp_path) == whole
 
 
 def test_a_lost_or_foreign_row_counts_as_not_done(
@@ -133,31 +109,24 @@ def test_a_lost_or_foreign_row_counts_as_not_done(
 def test_files_of_others_are_never_removed(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
-    (store.run_folder("k") / "log.txt").write_text("mine")
-    for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
-        with pytest.raises(
-            BatchError,
-            match=r"runs/k: would be replaced, and holds log\.txt, .*move it away",
-        ):
-            act()
-    assert (store.run_folder("k") / "log.txt").read_text() == "mine"
-    (store.run_folder("k") / "log.txt").write_text(OUTCOME.log)
-    notes = [
-        store.run_folder("k") / "notes.txt",
+    folder = store.run_folder("k")
+    others = [
+        folder / "notes.txt",
         *(tmp_path / "runs" / name / "a" for name in ("mine", ".partial-mine")),
     ]
-    for path in notes:
+    for path in others:
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
-    for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
-        with pytest.raises(
-            BatchError,
-            match=r"runs/k: would be replaced, and holds notes\.txt, .*move it away",
-        ):
-            act()
+    (folder / "log.txt").write_text("mine")
+    for name in ("log.txt", "notes.txt"):
+        told = rf"runs/k: would be replaced, and holds {name}, .*move it away"
+        for act in (lambda: store.discard("k"), lambda: store.write("k", OUTCOME)):
+            with pytest.raises(BatchError, match=told):
+                act()
+        (folder / "log.txt").write_text(OUTCOME.log)
     store.remove_partial()
-    assert [path.read_text() for path in notes] == ["mine"] * 3
+    assert [path.read_text() for path in others] == ["mine"] * 3
     assert store.row("k") == OUTCOME.row
-    notes[0].unlink()
+    others[0].unlink()
     store.discard("k")
-    assert not store.run_folder("k").exists()
+    assert not folder.exists()

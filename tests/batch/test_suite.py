@@ -14,6 +14,7 @@ from .conftest import BASIN, DEAD_RECKONING, HEADER
 SUITES = sorted((Path(__file__).parents[2] / "benchmarks" / "suites").glob("*.toml"))
 ISAM2 = '\n[[estimators]]\nname = "isam2"\n'
 LAG_TWICE = "params = { smoother.lag_s = 3 }\ngrid = { smoother.lag_s = [4] }\n"
+EXCLUSIVE = 'params = { identity.policy = "max-mixture" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
 AGAIN = ISAM2 + 'variant = "again"\n'
 PARK = 'dataset = "victoria-park"\n'
 DEAF = DEAD_RECKONING.replace("dead-", "deaf-")
@@ -59,22 +60,10 @@ def second(entry: str) -> str:
             "nmae: there is no such field; did you mean name?",
         ),
         (
-            HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING,
-            "name",
-            "name: expected a text",
-        ),
-        (
             HEADER.replace('"short"', '"a\\u001b[2J"') + BASIN + DEAD_RECKONING,
             "name",
             "expected a name without control",
         ),
-        (
-            end('variant = "a\\u202eb"\n'),
-            "variant",
-            "expected a name without control characters",
-        ),
-        (end("grdi = {}\n"), "grdi", "did you mean grid?"),
-        (log("seeds = -1.5\n"), "seeds", "seeds"),
         (
             log('log = "x.mcap"\n'),
             "[[logs]]",
@@ -92,8 +81,12 @@ def second(entry: str) -> str:
         (log("grid = { wrong_id_rate = [] }\n"), "grid", "has no values"),
         (log("grid = { laps = [1, 2] }\n"), "grid", "grid.laps: is also in options"),
         (end(ISAM2 + LAG_TWICE), "grid", "grid.smoother.lag_s: is also in params"),
+        (
+            end(ISAM2 + EXCLUSIVE),
+            "grid =",
+            'grid.history: history.policy = "bounded" cannot be with',
+        ),
         (log("seeds = 0\n"), "seeds", "has no seeds"),
-        (log("seeds = []\n"), "seeds", "has no seeds"),
         (log("landmarks = {}\n"), "[[logs]]", "a generator has its own"),
         (HEADER + BASIN + DEAF, "deaf", "estimators.0.name: no estimator is called"),
         (
@@ -111,7 +104,11 @@ def second(entry: str) -> str:
             "reference",
             "'dead-reckoning' does not run here; what does: isam2",
         ),
-        (head('metrics = ["ate"]\n'), "metrics", "there is no score 'ate'"),
+        (
+            head('metrics = ["causal.ate_ra"]\n'),
+            "metrics",
+            "did you mean causal.ate_raw_m?",
+        ),
         (log(second(BASIN)), "# second", "logs.1: two logs are called 'basin'"),
         (
             log(second(POOL)),
@@ -129,12 +126,9 @@ def second(entry: str) -> str:
             "estimators.2: 'basin', isam2/again, seed 0: is the same run as 'basin', isam2/default",
         ),
         (log("seeds = [1, 1]\n"), "seeds", "list of different whole numbers"),
-        (log("seeds = [-1]\n"), "seeds", "logs.0.seeds: expected the number of seeds"),
         (log("seeds = [9223372036854775808]\n"), "seeds", "to 9223372036854775807"),
         (log("seeds = 1000001\n"), "seeds", "up to 1000000"),
         (log("seeds = true\n"), "seeds", "not true"),
-        (log('seeds = "2"\n'), "seeds", "not '2'"),
-        (basin("120", "inf"), "options", "options.duration_s"),
         (
             log("grid = { wrong_id_rate = [0.1, 0.1] }\n"),
             "grid",
@@ -142,13 +136,6 @@ def second(entry: str) -> str:
         ),
         (basin("[[logs]]", "[logs]"), "[logs]", "expected a list of tables, [[logs]]"),
         (basin('"basin"\ngen', '"all logs"\ngen'), "all logs", "stands for all logs"),
-        (end("params = { lag = 3 }\n"), "lag = 3", "it has: gravity_interval_s"),
-        (head("metrics = []\n"), "metrics", "metrics"),
-        (
-            head('metrics = ["causal.ate_ra"]\n'),
-            "metrics",
-            "did you mean causal.ate_raw_m?",
-        ),
         (other('log = "no.mcap"\n'), "no.mcap", "no.mcap is not in"),
         (other('log = "suite.toml"\n'), "suite.toml", "not an MCAP file but a text"),
         (other('log = "."\n'), "log =", "is a folder without metadata.yaml"),

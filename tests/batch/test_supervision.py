@@ -33,19 +33,6 @@ def runners() -> list[psutil.Process]:
     ]
 
 
-def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(
-    planned, misbehaving
-):
-    perform_watched(planned(), AMPLE)  # compiled from here on
-    began = time.monotonic()
-    outcome = perform_watched(planned("sleeps"), Limits(2.0))
-    assert outcome.row["status"] == "timeout"
-    assert outcome.row["reason"] == "took longer than 2 s"
-    assert time.monotonic() - began < 30
-    assert not runners()
-    assert perform_watched(planned(), AMPLE).row["status"] == "ok"
-
-
 @pytest.mark.parametrize(
     ("estimator", "limits", "status", "reason"),
     [

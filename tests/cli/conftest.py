@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,16 +41,19 @@ def basin(basin_content, tmp_path) -> Path:
     return log
 
 
-@pytest.fixture(scope="session")
-def dive_content(tmp_path_factory) -> bytes:
-    log = tmp_path_factory.mktemp("log") / "dive.mcap"
-    write_log(log, small_world())
-    return log.read_bytes()
+@pytest.fixture
+def dive(tmp_path) -> Path:
+    """A log of 20 s, for commands that would do the same with any."""
+    write_log(tmp_path / "dive.mcap", small_world())
+    return tmp_path / "dive.mcap"
 
 
 @pytest.fixture
-def dive(dive_content, tmp_path) -> Path:
-    """A log of 20 s, for commands that would do the same with any."""
-    log = tmp_path / "dive.mcap"
-    log.write_bytes(dive_content)
-    return log
+def reply(run, capsys) -> Callable[..., Any]:
+    """Gives what ``sonar-graph`` prints with these arguments, after its expected exit code."""
+
+    def answer(code: int, *arguments: object) -> Any:
+        assert run(*arguments) == code
+        return capsys.readouterr()
+
+    return answer

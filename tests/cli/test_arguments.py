@@ -1,24 +1,18 @@
 """Settings, topics, calibrations and rates as a user writes them."""
 
-from typing import Annotated
-
 import pytest
-import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
-from typer.testing import CliRunner
 
 from sonar_graph.cli import arguments
 from sonar_graph.cli.arguments import (
     ReadingOptions,
     estimator_settings,
     parse_settings,
-    with_options,
 )
-from sonar_graph.logs import PartialCalibration
 
 
 @given(
@@ -55,41 +49,9 @@ def test_settings_go_to_their_estimator_at_any_depth():
     }
 
 
-def test_topics_go_to_their_roles(
-    tmp_path,
-):
-    assert ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"]).choices == {
-        "imu": "/imu/data",
-        "dvl": "/a=b",
-    }
-    for name, text in (
-        ("a.toml", "[imu]\ngyro_bias_sigma = 0.5\n"),
-        ("a.json", '{"imu": {"gyro_bias_sigma": 0.5}}'),
-    ):
-        (tmp_path / name).write_text(text)
-        given = ReadingOptions(calibration=tmp_path / name).given
-        assert given == PartialCalibration(
-            {"imu": {"gyro_bias_sigma": 0.5}}, str(tmp_path / name)
-        )
-
-
-def test_fields_of_a_group_are_options():
-    given: list[object] = []
-
-    @with_options("end", "salvage")
-    def command(
-        name: Annotated[str, typer.Argument()], reading: ReadingOptions, times: int = 2
-    ) -> None:
-        given.extend([name, reading, times])
-
-    app = typer.Typer()
-    app.command()(command)
-    assert (
-        CliRunner().invoke(app, ["a", "--start", "3", "--topic", "imu=/b"]).exit_code
-        == 0
-    )
-    assert given == ["a", ReadingOptions(topics=["imu=/b"], start="3"), 2]
-    assert CliRunner().invoke(app, ["a", "--salvage"]).exit_code == 2
+def test_topics_go_to_their_roles():
+    options = ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"])
+    assert options.choices == {"imu": "/imu/data", "dvl": "/a=b"}
 
 
 def test_nothing_that_a_terminal_obeys_is_printed(capsys):
@@ -108,6 +70,7 @@ def test_nothing_that_a_terminal_obeys_is_printed(capsys):
     "command",
     ["label", "recognise", "calibrate", "join", "calibration", "simulate landmarks"],
 )
-def test_a_command_that_has_no_use_for_a_map_refuses_it(run, basin, capsys, command):
-    assert run(*command.split(), basin, "--map", basin) == 2
-    assert "No such option: --map" in capsys.readouterr().err
+def test_a_command_that_has_no_use_for_a_map_refuses_it(basin, command, reply):
+    assert (
+        "No such option: --map" in reply(2, *command.split(), basin, "--map", basin).err
+    )

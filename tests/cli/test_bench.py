@@ -2,32 +2,26 @@
 
 import sys
 
-import sonar_graph
 from sonar_graph.cli.arguments import printable
 from sonar_graph.cli.bench import MOST_REASONS, reasons_told
 from tests.recorded_batches import drawn_batch, failed, written_batch
 
 
-def test_missing_packages_are_named_with_how_to_get_them(
-    run, tmp_path, capsys, monkeypatch
-):
+def test_missing_packages_are_named_with_how_to_get_them(tmp_path, monkeypatch, reply):
     (tmp_path / "suite.toml").touch()
-    for name in [name for name in sys.modules if name.startswith("sonar_graph.batch")]:
-        monkeypatch.delitem(sys.modules, name)
-    # back to the modules that are known by now
-    monkeypatch.setattr(sonar_graph, "batch", sonar_graph.batch)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert run("bench", tmp_path / "suite.toml", "-o", tmp_path / "out") == 2
-    assert "pip install 'sonar-graph[bench]'" in capsys.readouterr().err
+    assert (
+        "pip install 'sonar-graph[bench]'"
+        in reply(2, "bench", tmp_path / "suite.toml", "-o", tmp_path / "out").err
+    )
 
 
-def test_report_rebuilds_the_page_of_a_batch(run, tmp_path, capsys):
+def test_report_rebuilds_the_page_of_a_batch(tmp_path, reply):
     for folder, warned in (
         (written_batch(tmp_path / "\udcff"), ""),
         (written_batch(tmp_path / "part", not_run=3), "3 of 16 runs"),
     ):
-        assert run("report", folder) == 0
-        said = capsys.readouterr()
+        said = reply(0, "report", folder)
         assert said.out == f"Report: {printable(str(folder / 'report.html'))}\n"
         assert (folder / "tables" / "difference-ate-se2-m.csv").is_file()
         assert warned in (folder / "report.html").read_text("utf-8")

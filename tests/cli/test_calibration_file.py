@@ -39,8 +39,3 @@ def test_a_template_of_a_log_gives_its_calibration(run, capsys, basin, tmp_path)
     assert "floor" in said
     assert Calibration.model_validate(said) == stated
     assert read_log(basin, calibration=path).calibration == stated
-
-
-def test_without_template_the_command_says_what_to_give(run, capsys):
-    assert run("calibration") == 2
-    assert "give --template" in capsys.readouterr().err

@@ -7,15 +7,15 @@ from tests.synthetic import basin_comparison
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(run, tmp_path, capsys):
+def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(tmp_path, reply):
     result = write_report(basin_comparison(60), tmp_path / "result").parent
-    assert run("figures", result) == 0
     assert (
-        capsys.readouterr().out
+        reply(0, "figures", result).out
         == f"Figures and tables: {result / 'paper' / 'protocol.txt'}\n"
     )
     assert (result / "paper" / "figures" / "map.pdf").is_file()
-    assert run("figures", tmp_path) == 2
-    assert "no comparison.json in it" in capsys.readouterr().err
-    assert run("figures", result, "-o", result) == 2
-    assert "holds a comparison, and would become a paper" in capsys.readouterr().err
+    assert "no comparison.json in it" in reply(2, "figures", tmp_path).err
+    assert (
+        "holds a comparison, and would become a paper"
+        in reply(2, "figures", result, "-o", result).err
+    )

@@ -31,19 +31,6 @@ def sensor(said: dict, quantity: str) -> dict:
     return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
 
 
-@pytest.mark.slow
-def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log, tmp_path):
-    (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
-    here = sensor(answer(log), "DVL against IMU: time offset")
-    there = sensor(
-        answer(log, "--log-config", tmp_path / "late.toml"),
-        "DVL against IMU: time offset",
-    )
-    assert there["value"] - here["value"] == pytest.approx(-0.5, abs=there["sigma"])
-    assert there["sigma"] < 0.1
-    assert there["act"]
-
-
 def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
     yaw = sensor(
@@ -83,10 +70,9 @@ def test_sentences_say_whether_to_act(log):
 
 
 def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
-    run, basin, monkeypatch, capsys
+    basin, monkeypatch, reply
 ):
-    assert run("inspect", basin) == 0
-    shown = capsys.readouterr().out
+    shown = reply(0, "inspect", basin).out
     for name in (
         "sensor_msgs/msg/Imu",
         "marine_acoustic_msgs/msg/Dvl",
@@ -97,27 +83,19 @@ def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(
     monkeypatch.setattr(
         LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)")
     )
-    assert run("inspect", basin) == 1
-    *_, lack, advice = capsys.readouterr().out.splitlines()
+    *_, lack, advice = reply(1, "inspect", basin).out.splitlines()
     assert lack == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
     assert "--toml > log.toml" in advice
 
 
 def test_of_very_many_topics_the_first_are_shown_and_the_others_counted(
-    run, basin, monkeypatch, capsys
+    basin, monkeypatch, reply
 ):
     monkeypatch.setattr("sonar_graph.cli.inspect_log.MOST_TOPICS", 2)
-    assert run("inspect", basin, "--quick") == 0
     shown, hidden = re.search(
-        r"(?s)(.*?)not shown (\d+) more topics", capsys.readouterr().out
+        r"(?s)(.*?)not shown (\d+) more topics",
+        reply(0, "inspect", basin, "--quick").out,
     ).groups()
     topics = {topic["name"] for topic in answer(basin, "--quick")["topics"]}
     assert len(topics) == 2 + int(hidden)
     assert sum(f"\n{name} " in shown for name in topics) == 2
-
-
-def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
-    log = tmp_path / "victoria_park.mcap"
-    assert run("convert", "dataset", "victoria-park", "-o", log) == 0
-    assert "3640 landmark detections" in capsys.readouterr().out
-    assert run("inspect", log) == 0

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from sonar_graph.calibration import (
     Calibration,
@@ -24,6 +22,7 @@ from sonar_graph.logs import (
     write_log,
 )
 from sonar_graph.logs.mcap import recording
+from tests.logs.converters import copies
 from tests.logs.converters.sonar_recordings import Aris, images
 from tests.recognition.imaged_lane import TOPIC, Lane
 
@@ -51,12 +50,9 @@ def both(lane, tmp_path_factory) -> tuple[Path, Path]:
     return images_log(lane, folder / "images.mcap"), folder / "nav.mcap"
 
 
-def test_images_are_moved_to_the_clock_of_the_navigation(
-    lane, both, run, tmp_path, capsys
-):
+def test_images_are_moved_to_the_clock_of_the_navigation(lane, both, tmp_path, reply):
     out = tmp_path / "joined.mcap"
-    assert run("join", *both, "-o", out) == 0
-    said = capsys.readouterr().out
+    said = reply(0, "join", *both, "-o", out).out
     match = re.search(
         r"Clock offset, to be added .*: \+(\d\.\d+) s ± (\d\.\d+) s", said
     )
@@ -84,29 +80,7 @@ def bare(lane, tmp_path_factory) -> Path:
     """Navigation as another program writes it: mountings in ``/tf_static``, and no record of this package."""
     folder = tmp_path_factory.mktemp("bare")
     write_log(folder / "whole.mcap", lane.sequence)
-    with (
-        (folder / "whole.mcap").open("rb") as stream,
-        (folder / "nav.mcap").open("wb") as out,
-    ):
-        writer = Writer(out)
-        channels = {}
-        writer.start()
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.topic not in channels:
-                number = writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-                channels[channel.topic] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.topic],
-                message.log_time,
-                message.data,
-                message.publish_time,
-            )
-        writer.finish()
-    return folder / "nav.mcap"
+    return copies.bare(folder / "whole.mcap", folder / "nav.mcap")
 
 
 def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
@@ -117,15 +91,11 @@ def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
     assert expected != Mounting()
     assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
     joined = read_log(out)
-    np.testing.assert_allclose(
-        joined.calibration.sonar.mounting.translation_m,
-        expected.translation_m,
-        atol=1e-12,
-    )
-    np.testing.assert_allclose(
-        joined.calibration.sonar.mounting.rpy_rad, expected.rpy_rad, atol=1e-12
-    )
-    assert joined.calibration.sonar.image.decibel_span == 75.0
+    sonar = joined.calibration.sonar
+    for name in ("translation_m", "rpy_rad"):
+        found = getattr(sonar.mounting, name)
+        assert found == pytest.approx(getattr(expected, name), abs=1e-12)
+    assert sonar.image.decibel_span == 75.0
     assert "not stated" in joined.notes["log.start"]
 
 
@@ -138,67 +108,52 @@ def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
         "[floor]\nz_m = -3.0\nsigma_m = 0.02\n[start]\nposition_m = [1.0, 2.0, -0.5]\n"
         "[sonar.mounting]\nrpy_rad = [0.0, 0.3, 0.0]\n"
     )
+    words = "-o", out, "--offset", OFFSET_S, "--calibration", given
     for navigation in (bare, both[1]):
-        assert (
-            run(
-                "join",
-                both[0],
-                navigation,
-                "-o",
-                out,
-                "--offset",
-                OFFSET_S,
-                "--calibration",
-                given,
-            )
-            == 0
-        )
+        assert run("join", both[0], navigation, *words) == 0
         found = read_log(out).calibration
         assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
         assert found.start.position_m == (1.0, 2.0, -0.5)
         assert found.sonar.mounting.rpy_rad == (0.0, 0.3, 0.0)
-        assert found.dvl.mounting.rpy_rad == pytest.approx(
-            read_log(navigation).calibration.dvl.mounting.rpy_rad
-        )
+        dvl = read_log(navigation).calibration.dvl
+        assert found.dvl.mounting.rpy_rad == pytest.approx(dvl.mounting.rpy_rad)
 
 
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
-    lane, both, run, tmp_path, capsys
+    lane, both, tmp_path, reply
 ):
     out = tmp_path / "joined.mcap"
-    assert run("join", *both, "-o", out, "--offset", OFFSET_S) == 0
-    said = capsys.readouterr().out
+    said = reply(0, "join", *both, "-o", out, "--offset", OFFSET_S).out
     assert "+2.400 s, as stated; by the images +2.4" in said
     assert "Warning" not in said
     stamps = np.concatenate([block.stamps_ns for block in read_sonar_frames(out)])
     np.testing.assert_array_equal(stamps, lane.frames.stamps_ns)
-    assert run("join", *both, "-o", out, "--offset", 3.5) == 0
-    assert "Warning: they do not agree" in capsys.readouterr().out
+    assert (
+        "Warning: they do not agree"
+        in reply(0, "join", *both, "-o", out, "--offset", 3.5).out
+    )
 
 
 def test_files_without_common_time_are_refused_with_an_offset(
-    lane, both, run, tmp_path, capsys
+    lane, both, tmp_path, reply
 ):
     far = images_log(lane, tmp_path / "far.mcap", offset_s=1.2e9)
     out = tmp_path / "joined.mcap"
-    assert run("join", far, both[1], "-o", out) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = reply(2, "join", far, both[1], "-o", out).err.splitlines()
     found = re.search(
         r"far\.mcap: \d.* s; .*nav\.mcap: \d.* s: no common time; .* \(\+(\d+\.\d+) makes",
         line,
     )
     assert found
     assert not out.exists()
-    assert (
-        run("join", far, both[1], "-o", out, "--offset", float(found[1]), "--search", 3)
-        == 0
-    )
-    refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", capsys.readouterr().out)
+    words = "-o", out, "--offset", float(found[1]), "--search", 3
+    said = reply(0, "join", far, both[1], *words).out
+    refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", said)
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
 def test_an_offset_that_few_images_cannot_show_must_be_stated(
-    both, run, tmp_path, capsys
+    both, run, tmp_path, reply
 ):
     file = tmp_path / "dive.aris"
     file.write_bytes(Aris(images(6, 128, 300)).content())
@@ -206,26 +161,10 @@ def test_an_offset_that_few_images_cannot_show_must_be_stated(
     first_ns = next(read_sonar_frames(recorded)).stamps_ns[0]
     offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
     out = tmp_path / "joined.mcap"
-    assert (
-        run(
-            "join",
-            recorded,
-            both[1],
-            "-o",
-            out,
-            "--offset",
-            f"{offset_s:.6f}",
-            "--search",
-            2,
-        )
-        == 2
-    )
-    assert (
-        "steps between them could be measured, and 50 are needed; state it"
-        in capsys.readouterr().err
-    )
-    assert run("join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}") == 0
-    assert "as stated; the images do not determine" in capsys.readouterr().out
+    words = "join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}"
+    few = "steps between them could be measured, and 50 are needed; state it"
+    assert few in reply(2, *words, "--search", 2).err
+    assert "as stated; the images do not determine" in reply(0, *words).out
     assert sum(len(block) for block in read_sonar_frames(out)) == 6
 
 
@@ -233,15 +172,3 @@ def converted(run, recorded: Path) -> Path:
     out = recorded.with_suffix(".mcap")
     assert run("convert", "aris", recorded, "-o", out) == 0
     return out
-
-
-def test_navigation_that_has_images_is_refused_before_reading_others(
-    lane_log, run, tmp_path, capsys
-):
-    nothing = tmp_path / "none.aris"
-    nothing.write_bytes(b"")
-    assert run("join", nothing, lane_log, "-o", tmp_path / "joined.mcap") == 2
-    assert (
-        f"{lane_log}: has /sonar/image already; recognise it as it is"
-        in capsys.readouterr().err
-    )

@@ -28,9 +28,8 @@ def commands(
     return found
 
 
-def test_no_argument_shows_the_commands(run, capsys):
-    assert run() == 0
-    shown = capsys.readouterr().out
+def test_no_argument_shows_the_commands(reply):
+    shown = reply(0).out
     for path in commands():
         assert path[0] in shown
 
@@ -57,9 +56,11 @@ def test_help_loads_nothing_heavy(run, dive, tmp_path):
     assert not list(cache.rglob("*.nbi"))
 
 
-def test_version_is_that_of_the_package_which_can_be_run_as_a_module(run, capsys):
-    assert run("--version", "nonsense") == 0
-    assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
+def test_version_is_that_of_the_package_which_can_be_run_as_a_module(run, reply):
+    assert (
+        reply(0, "--version", "nonsense").out
+        == f"sonar-graph {sonar_graph.__version__}\n"
+    )
     done = subprocess.run(
         [sys.executable, "-m", "sonar_graph", "--version"],
         capture_output=True,
@@ -76,35 +77,20 @@ GROUPS = {(path[0],): None for path in commands() if len(path) > 1}
 
 
 @pytest.mark.parametrize("path", commands() | GROUPS, ids=" ".join)
-def test_every_command_and_group_has_help_that_ends_in_examples(run, path, capsys):
-    assert run(*path, "--help") == 0
+def test_every_command_and_group_has_help_that_ends_in_examples(path, reply):
     assert (
         f"sonar-graph {' '.join(path)}"
-        in capsys.readouterr().out.partition("Examples:")[2]
+        in reply(0, *path, "--help").out.partition("Examples:")[2]
     )
 
 
 def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
-    for name in (
-        *files.split(),
-        "imu.csv",
-        "dvl.csv",
-        "dive_sonar.mcap",
-        "labels.json",
-    ):
+    files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw suite.toml imu.csv dvl.csv"
+    folders = "comparison MRCLAM_Dataset6 A-KIT StPereDataset ros2_bag_folder folder_of_tables"
+    for name in (*files.split(), "dive_sonar.mcap", "labels.json"):
         Path(name).touch()
-    for name in (
-        "comparison",
-        "MRCLAM_Dataset6",
-        "DLR",
-        "A-KIT",
-        "StPereDataset",
-        "ros2_bag_folder",
-        "results",
-        "folder_of_tables",
-    ):
+    for name in folders.split():
         Path(name).mkdir()
     for path, command in commands().items():
         lines = [line.partition(" > ")[0] for line in command.epilog.splitlines()]

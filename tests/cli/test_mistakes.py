@@ -1,5 +1,6 @@
 """A user's mistake ends with code 2 and one line that names it, and no file is written; other errors are not hidden."""
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,33 +34,27 @@ def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
         )
     ]
     write_recording(folder / "images.mcap", images, {})
+    (folder / "killed").mkdir()
+    large = CIRCLE.replace("0.15", "1.0")
+    label = {"range_m": 1.9, "azimuth_rad": 0.0, "id": 12}
+    label["stamp_ns"] = int(lane.frames.stamps_ns[40])
+    high = "[floor]\nz_m = -1700.0\nsigma_m = 0.1\n[start]\nposition_m = [0.0, 0.0, -700.0]\nrpy_rad = [0.0, 0.5, 0.0]\n"
     texts = {
         "notes.txt": "these are = = words",
         "words.json": "{ no",
         "list.json": "[1]",
-    }
-    texts |= {"strange.toml": DESIGN.format(id=9, size_m=0.6, shape=BAR)}
-    texts |= {"broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE)}
-    texts |= {
-        "large.toml": DESIGN.format(
-            id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0")
-        )
-    }
-    high = "[floor]\nz_m = -1700.0\nsigma_m = 0.1\n[start]\nposition_m = [0.0, 0.0, -700.0]\nrpy_rad = [0.0, 0.5, 0.0]\n"
-    texts |= {
+        "strange.toml": DESIGN.format(id=9, size_m=0.6, shape=BAR),
+        "broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE),
+        "large.toml": DESIGN.format(id=4, size_m=2.0, shape=large),
         "millimetres.toml": high,
         "labels.json": '{"log": "lane.mcap", "labels": []}',
-    }
-    texts |= {
+        "twelve.json": json.dumps({"log": "lane.mcap", "labels": [label]}),
         "gyro.toml": "[imu]\ngyro_sigma = 1\n",
         "logs.toml": 'name = "x"\nreference = "isam2"\nlogs = 3\n',
-    }
-    texts |= {
         "late.toml": SUITE,
         "killed/.sonar_graph.json": '{"format": "sonar_graph folder 1", "kind": "batch", "files": {}}',
+        "killed/.lock": "",
     }
-    (folder / "killed").mkdir()
-    texts["killed/.lock"] = ""
     for name, text in texts.items():
         (folder / name).write_text(text)
     (folder / "empty").mkdir()
@@ -125,6 +120,7 @@ MISTAKES = {
     "convert dataset mrclam empty --number 1 -o new.mcap": "empty",
     "convert dataset dlr empty --number 1 -o new.mcap": "data set dlr: expected FOLDER",
     "report empty": "empty",
+    "calibration": "give --template",
     "report killed": "before any of its runs was done; give the bench command that began it again",
     "bench logs.toml -o out": r"logs\.toml, line 3: logs",
     "bench late.toml -o out": r"late\.toml, line 7: est",
@@ -151,21 +147,27 @@ MISTAKES = {
     "calibrate bare.mcap -o new.json": r"bare\.mcap: has no sonar images",
     "calibrate lane.mcap lane.mcap -o new.json": r"lane\.mcap: is named twice.*name each log once",
     "calibrate lane.mcap -o new.json --designs strange.toml": "true landmarks are 1, 2, 3, 4, the designs are 9: ",
+    "calibrate lane.mcap -o new.json --labels labels.json": r"labels\.json: 0 of 0 labels met .*; too few labelled fr",
+    "calibrate lane.mcap -o new.json --labels labels.json --labels labels.json": "1 logs and 2 files for --labels; give",
+    "calibrate lane.mcap -o new.json --labels twelve.json": "its labels name landmark 12, the designs are 1, 2, 3, 4",
+    "calibrate lane.mcap -o new.json --motion images": "--motion is for --labels",
+    "join notes.txt lane.mcap -o new.mcap": r"lane\.mcap: has /sonar/image already; recognise it as it is",
+    "label lane.mcap -o new.toml": r"expected the name of a file that ends in \.json",
+    "recognise lane.mcap -o new.mcap --report page.pdf": r"expected the name of a file that ends in \.html",
     "calibrate lane.mcap -o new.json --set identity.unknown_pror=1": r"identity\.unknown_pror: .*unknown_prior",
 }
 
 
 @pytest.mark.parametrize(("command", "expected"), MISTAKES.items())
 def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
-    run, command, expected, files, monkeypatch, capsys
+    command, expected, files, monkeypatch, reply
 ):
     def content() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in files.rglob("*") if path.is_file()}
 
     before = content()
     monkeypatch.chdir(files)
-    assert run(*command.split()) == 2
-    said = capsys.readouterr().err
+    said = reply(2, *command.split()).err
     assert re.fullmatch(r"sonar-graph: .+\n", said)
     assert re.search(expected, said), said
     assert content() == before
@@ -175,11 +177,13 @@ def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
     "stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")]
 )
 def test_interruption_and_refused_access_end_in_one_line(
-    run, stop, basin, monkeypatch, capsys
+    stop, basin, monkeypatch, reply
 ):
     monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(stop))
-    assert run("inspect", basin) == (130 if stop is KeyboardInterrupt else 2)
-    assert re.fullmatch(r"sonar-graph: .+\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"sonar-graph: .+\n",
+        reply(130 if stop is KeyboardInterrupt else 2, "inspect", basin).err,
+    )
 
 
 def test_unforeseen_error_is_not_hidden(basin, monkeypatch):

@@ -17,49 +17,22 @@ JANUS = np.column_stack(
         np.full(4, np.cos(TILT)),
     ]
 )
-VELOCITY = np.array([1.2, -0.3, 0.1])
-subsets = st.lists(st.booleans(), min_size=4, max_size=4)
-seeds = st.integers(0, 2**32 - 1)
 
 
-def solved(directions, valid):
-    """One ping of a known velocity without noise."""
-    velocity, cov = velocity_of_beams(
-        directions, (directions @ VELOCITY)[None], np.array([valid]), SIGMA
-    )
-    return velocity[0], cov[0]
-
-
-def test_four_janus_beams_give_velocity_and_covariance_of_the_textbook():
-    """By least squares; horizontally sigma^2 / (2 sin^2 tilt), vertically sigma^2 / (4 cos^2 tilt)."""
-    along = JANUS @ VELOCITY + SIGMA * np.random.default_rng(0).standard_normal((1, 4))
-    velocity, cov = velocity_of_beams(JANUS, along, np.ones((1, 4), dtype=bool), SIGMA)
-    across = SIGMA**2 / (2 * np.sin(TILT) ** 2)
-    down = SIGMA**2 / (4 * np.cos(TILT) ** 2)
-    np.testing.assert_allclose(velocity, along @ np.linalg.pinv(JANUS).T, atol=1e-12)
-    np.testing.assert_allclose(cov[0], np.diag([across, across, down]), atol=1e-16)
-
-
-@given(valid=subsets, seed=seeds)
-def test_the_information_is_the_sum_over_the_beams(valid, seed):
+@given(valid=st.lists(st.booleans(), min_size=4, max_size=4), seed=st.integers(0, 99))
+def test_velocity_is_least_squares_and_information_the_sum_over_beams(valid, seed):
+    """The velocity is 0 along what no beam measured."""
     directions = JANUS @ Rotation.random(random_state=seed).as_matrix()
-    velocity, cov = solved(directions, valid)
-    used = directions[np.array(valid)]
+    along = np.random.default_rng(seed).standard_normal((1, 4))
+    (velocity,), cov = velocity_of_beams(directions, along, np.array([valid]), SIGMA)
+    used = directions[valid]
+    expected = np.linalg.pinv(used) @ along[0, valid]
+    np.testing.assert_allclose(velocity, expected, atol=1e-12)
     total = used.T @ used / SIGMA**2
-    np.testing.assert_allclose(
-        np.linalg.inv(cov), total, atol=2 / UNMEASURED_M_S**2, rtol=1e-5
-    )
-    np.testing.assert_allclose(used @ velocity, used @ VELOCITY, atol=1e-12)
-    assert is_partial(cov[None])[0] == (sum(valid) < 3)
-
-
-@given(valid=subsets, more=st.integers(0, 3))
-def test_a_further_beam_never_takes_information_away(valid, more):
-    _, before = solved(JANUS, valid)
-    _, after = solved(JANUS, [v or k == more for k, v in enumerate(valid)])
-    gained = np.linalg.eigvalsh(np.linalg.inv(after) - np.linalg.inv(before))
-    assert gained[0] > -1e-4
-    assert (gained[-1] > 1.0 / SIGMA**2 - 1e-3) == (not valid[more])
+    unmeasured = 1 / UNMEASURED_M_S**2
+    found = np.linalg.inv(cov[0])
+    np.testing.assert_allclose(found, total, atol=2 * unmeasured, rtol=1e-5)
+    assert is_partial(cov)[0] == (sum(valid) < 3)
 
 
 def test_rows_do_not_mix_and_what_is_not_valid_may_be_anything():

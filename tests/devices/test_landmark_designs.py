@@ -121,18 +121,12 @@ def test_a_folder_gives_all_designs_and_a_missing_file_is_named(
             HALF.replace('name = "half"', ""),
             r"\[\[landmark\]\] number 1: name: is missing",
         ),
-        (HALF.replace("= 0.4", "= inf"), "'half': size_m: .*not inf"),
         (HALF.replace("= 0.4", "= 0.0005"), "'half': size_m: .*not 0.0005"),
-        (
-            HALF.replace("= 0.4", "= 42.0"),
-            "'half': size_m: .*less than or equal to 2, not 42",
-        ),
         (HALF.replace("= 0.02", "= nan"), "'half': height_m: .*not nan"),
         (
             HALF.replace("id = 7", "id = 100000000000000000000"),
             "'half': id: .*less than or equal to 2147483647",
         ),
-        (HALF.replace("= 5.0", "= nan"), "'half': shape 1.level_db: .*not nan"),
         (HALF.replace("= 5.0", "= inf"), "'half': shape 1.level_db: .*not inf"),
         (
             HALF.replace("[0.0, 0.2]]", "[0.0, inf]]"),
@@ -142,11 +136,6 @@ def test_a_folder_gives_all_designs_and_a_missing_file_is_named(
             HALF.replace("= 5.0", "= 2.0"),
             "'half': nowhere more than 2 dB over the floor",
         ),
-        (
-            HALF.replace("= 5.0", "= -5.0"),
-            "'half': nowhere more than -5 dB over the floor",
-        ),
-        (HALF.replace("0.2", "0.0"), "'half': shape 1 covers nothing of the square"),
         (
             HALF.replace("0.0,", "0.3,"),
             "shape 1 covers nothing of the square, which reaches from -0.2 to 0.2 m",
@@ -159,7 +148,6 @@ def test_a_folder_gives_all_designs_and_a_missing_file_is_named(
             HALF.replace("[[landmark]]", "[landmark]"),
             r"landmark: write \[\[landmark\]\] with two brackets",
         ),
-        ("landmark = [3]", r"landmark: write \[\[landmark\]\] with two brackets"),
         ("[imu]\n", r"imu: unknown; a designs file has \[\[landmark\]\] tables only"),
         (HALF.replace("shapes", "#"), "give either shapes or picture"),
         (

@@ -6,6 +6,7 @@ down and a world of north, east, down. ``docs/theory/datasets.md`` derives from 
 the sign of the IMU's y axis, the times of the rows, the lever arms, and that the gyros measure the Earth's rotation.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,17 +59,6 @@ REFERENCE_COLUMNS = (
     "Pitch",
     "Yaw",
 )
-
-
-def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
-    """Rotation of world (east, north, up) from body (forward, left, up), from north-east-down angles.
-
-    ``enu_R_ned Rz(yaw) Ry(pitch) Rx(roll) frd_R_flu``.
-    """
-    ned_R_frd = Rotation.from_euler(
-        "ZYX", np.column_stack([yaw_rad, pitch_rad, roll_rad])
-    ).as_matrix()
-    return Rotation.from_matrix(ENU_R_NED @ ned_R_frd @ np.diag(FLU_OF_FRD))
 
 
 def reference_offset_s(imu: Imu, reference: Trajectory) -> float:
@@ -151,17 +141,17 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     unknown = np.full((len(dvl_ns), 3, 3), np.nan)
     dvl = Dvl(DVL_DELAY_NS + dvl_ns, velocity, unknown)
     longitude, latitude, altitude = reference_rows[:, 1:4].T
-    quaternions = enu_R_flu(*reference_rows[:, 7:10].T).as_quat()
+    # roll, pitch and yaw of north-east-down: enu_R_ned Rz(yaw) Ry(pitch) Rx(roll) frd_R_flu
+    ned_R_frd = Rotation.from_euler("ZYX", reference_rows[:, 9:6:-1]).as_matrix()
+    enu_R_flu = ENU_R_NED @ ned_R_frd @ np.diag(FLU_OF_FRD)
+    quaternions = Rotation.from_matrix(enu_R_flu).as_quat()
     origin = (float(latitude[0]), float(longitude[0]), 0.0)
     positions = east_north_up(latitude, longitude, altitude, origin)
     truth = Trajectory.without_covariances(reference_ns, positions, quaternions)
     offset_s = reference_offset_s(imu, truth)
-    shifted_ns = reference_ns + round(offset_s * NS_PER_S)
+    truth = replace(truth, stamps_ns=reference_ns + round(offset_s * NS_PER_S))
     # before the IMU's first row there is nothing to compare
-    is_kept = shifted_ns >= 0
-    truth = Trajectory.without_covariances(
-        shifted_ns[is_kept], positions[is_kept], quaternions[is_kept]
-    )
+    truth = truth.rows(np.flatnonzero(truth.stamps_ns >= 0))
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:
         raise DatasetError(

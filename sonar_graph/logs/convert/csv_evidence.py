@@ -123,39 +123,29 @@ def _of_one_dive(
 def marked_valid(
     file: CsvFile, names: Iterable[str], velocity: Floats
 ) -> Iterator[tuple[str, int, Floats]]:
-    """Columns, among some, that mark valid rows, with the mark and the values; the likeliest name first.
+    """Columns, among some, that mark valid rows, with the mark, 0 or 1, and the values; the likeliest name first.
 
-    ``velocity`` are the velocities of all rows, shape (n, 3).
+    The mark is known by the velocities of all rows, ``velocity`` of shape (n, 3), else by the name.
     """
+    absent = is_absent(velocity)
     likely = [n for word in VALIDITY for n in names if word in n.lower()]
     # a name may hold two of the words
     for name in dict.fromkeys(likely):
         (marks,) = file.numbers(name)
-        mark = valid_mark(name, marks, velocity)
-        if mark is not None:
-            yield name, mark, marks
-
-
-def valid_mark(name: str, marks: Floats, velocity: Floats) -> int | None:
-    """Mark of valid rows, 0 or 1, by the velocities, shape (n, 3), of the other rows, else by the name; None: unclear.
-
-    ``name`` is that of the column, ``marks`` its values, shape (n,).
-    """
-    # counts of beams and codes of errors have more than two values
-    if not np.isin(marks, (0.0, 1.0)).all():
-        return None
-    absent = is_absent(velocity)
-    for mark in (1, 0):
-        is_other = marks != mark
-        if is_other.any() and absent[is_other].all() and not absent[~is_other].all():
-            return mark
-    # the velocities prove nothing where a driver holds the last one
-    name = name.lower()
-    if re.search(r"valid|lock|good", name) and not re.search(
-        r"invalid|status|unlock", name
-    ):
-        return 1
-    return None
+        # counts of beams and codes of errors have more than two values
+        if not np.isin(marks, (0.0, 1.0)).all():
+            continue
+        for mark in (1, 0):
+            lost = absent[marks != mark]
+            if len(lost) and lost.all() and not absent[marks == mark].all():
+                yield name, mark, marks
+                break
+        else:
+            # the velocities prove nothing where a driver holds the last one
+            if re.search(r"valid|lock|good", name.lower()) and not re.search(
+                r"invalid|status|unlock", name.lower()
+            ):
+                yield name, 1, marks
 
 
 def is_absent(vectors: Floats) -> NDArray[np.bool_]:

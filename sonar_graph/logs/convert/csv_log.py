@@ -71,24 +71,12 @@ class CsvRole:
     adapter: Adapter
 
 
-def read_csv_config(path: Path) -> dict[str, CsvRole]:
-    """Read a TOML file that maps the columns of tables to roles; its roles by name.
-
-    A LogError where it cannot be read, is not TOML, or has a key that cannot be; it names table and key.
-    """
-    return parse_csv_config(read_toml(path), str(path))
-
-
 def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRole]:
-    """Roles from values as TOML gives them; errors as in `read_csv_config`, with the name of a ``source``."""
-    shared: dict[str, Any] = {}
-    tables: dict[str, dict[str, Any]] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            tables[key] = dict(value)
-        elif key in SHARED:
-            shared[key] = value
-        else:
+    """Roles by name from values as TOML gives them; a LogError that names ``source``, table and key that cannot be."""
+    tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
+    shared = {key: value for key, value in values.items() if key not in tables}
+    for key in shared:
+        if key not in SHARED:
             raise LogError(
                 f"{source}: {key}: stands before the first table and so for all of them; a role is a table such as "
                 "[imu], and other keys belong into one"
@@ -99,9 +87,7 @@ def parse_csv_config(values: Mapping[str, Any], source: str) -> dict[str, CsvRol
             raise LogError(
                 f"{source}: there is no role [{role}]; {hint}tables are for {', '.join(CSV_ADAPTERS)}"
             )
-    found = {
-        role: _role(role, shared | table, source) for role, table in tables.items()
-    }
+    found = {role: _role(role, shared | dict(tables[role]), source) for role in tables}
     for role in ("imu", "dvl"):
         if role not in found:
             raise LogError(
@@ -200,15 +186,15 @@ def read_csv(
     >>> sequence.imu.specific_force[0].round(3), sequence.dvl.velocity[0]
     (array([-0.   ,  0.   ,  9.807]), array([ 0.15,  0.  ,  0.  ]))
     """
-    given = [tables] if isinstance(tables, str | Path) else list(tables)
-    files = table_files([as_path(one, "read_csv(tables)") for one in given])
-    if isinstance(config, Mapping):
-        source = "config"
-        roles = parse_csv_config(config, source)
-    else:
+    given = [tables] if isinstance(tables, str | Path) else tables
+    files = table_files(as_path(one, "read_csv(tables)") for one in given)
+    source = "config"
+    values = config
+    if not isinstance(values, Mapping):
         source = str(config)
-        roles = read_csv_config(as_path(config, "read_csv(tables, config)"))
-        name = name or spelt(Path(config).stem)
+        values = read_toml(as_path(config, "read_csv(tables, config)"))
+        name = name or spelt(Path(source).stem)
+    roles = parse_csv_config(values, source)
     found = {role: _table(one, files, source) for role, one in roles.items()}
     # before anything is read: a wrong unit of time makes all other messages misleading
     _require_units(roles, found)
@@ -333,11 +319,12 @@ def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
             f"given: {', '.join(files)}"
         )
     adapter = one.adapter
+    has_times = one.role != "true_landmarks"
     return CsvTable(
         CsvFile(files[wanted], one.form),
         one.role,
-        one.adapter.fields(),
-        adapter.stamp if one.role != "true_landmarks" else None,
+        adapter.fields(),
+        adapter.stamp if has_times else None,
         adapter.stamp_unit_s,
         adapter.stamp_offset_s,
     )

@@ -6,7 +6,7 @@ line with a number: its own lines, or else the last comment, where that names as
 
 import csv
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from datetime import UTC, date, datetime, timedelta
 from decimal import Decimal, InvalidOperation
@@ -59,7 +59,9 @@ class CsvForm(Section):
 
     def is_value(self, cell: str) -> bool:
         """True for a cell of a row, not of a header: a number, or a date."""
-        return is_number(cell.replace(self.decimal, ".")) or is_date(cell)
+        return reads_as(float, cell.replace(self.decimal, ".")) or reads_as(
+            date_ns, cell
+        )
 
 
 class CsvFile:
@@ -273,7 +275,9 @@ class CsvTable(FieldTable):
             try:
                 self._values[path] = np.array(plain, dtype=np.float64)
             except ValueError:
-                row = next(k for k, cell in enumerate(plain) if not is_number(cell))
+                row = next(
+                    k for k, cell in enumerate(plain) if not reads_as(float, cell)
+                )
                 is_comma = "," in plain[row]
                 decimal = '; decimal = "," where numbers are written so' * is_comma
                 raise LogError(
@@ -292,7 +296,7 @@ class CsvTable(FieldTable):
         # decimals: a double keeps only a quarter of a microsecond of a time since 1970
         unit_ns = Decimal(repr(unit_s)) * NS_PER_S
         decimal = self.file.form.decimal
-        self.has_dates = bool(cells) and is_date(cells[0])
+        self.has_dates = bool(cells) and reads_as(date_ns, cells[0])
         stamps = np.empty(len(cells), np.int64)
         for row, cell in enumerate(cells):
             try:
@@ -333,19 +337,10 @@ def _delimiter_of(line: str, decimal: str = ".") -> str:
     return next((d for d in "\t;," if d in bare and d != decimal), " ")
 
 
-def is_number(cell: str) -> bool:
-    """True for what Python takes for a number."""
+def reads_as(kind: Callable[[str], object], cell: str) -> bool:
+    """True for a cell that ``float`` or `date_ns` reads."""
     try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def is_date(cell: str) -> bool:
-    """True for a date with a time."""
-    try:
-        date_ns(cell)
+        kind(cell)
     except ValueError:
         return False
     return True

@@ -37,7 +37,13 @@ from sonar_graph.logs.convert.csv_evidence import (
     time_units,
 )
 from sonar_graph.logs.convert.csv_log import table_files
-from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, is_date, plain_name
+from sonar_graph.logs.convert.csv_table import (
+    CsvFile,
+    CsvForm,
+    date_ns,
+    plain_name,
+    reads_as,
+)
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import toml_value
 
@@ -261,7 +267,7 @@ class _Table:
             steps = np.diff(self.values([column])[:, 0])
             # some loggers write a few rows late
             is_growing = not len(steps) or (np.mean(steps >= 0) > 0.9 and steps.any())
-            if is_date(self.first(column)) or is_growing:
+            if reads_as(date_ns, self.first(column)) or is_growing:
                 return column
         return None
 
@@ -273,12 +279,8 @@ class _Table:
             for c in self.columns
             if is_truth or re.search(PARTS["truth"].files, c.name)
         ]
-        live = [
-            column
-            for column in self.columns
-            if column not in (*true, self.time)
-            and not re.search(_NOT_MEASURED, column.name)
-        ]
+        measured = [c for c in self.columns if not re.search(_NOT_MEASURED, c.name)]
+        live = [c for c in measured if c not in (*true, self.time)]
         # "angular_velocity" is a velocity by its name
         rates = self.find("angular_velocity", live)
         not_rates = [c for c in live if not rates or c not in rates.chosen]
@@ -291,8 +293,7 @@ class _Table:
         elif not has_place:
             yield from self._play("imu", live, "no accelerometer: is this the IMU?")
         yield from self._play("dvl", not_rates)
-        detections = list(self._play("detections", live))
-        if detections:
+        if detections := list(self._play("detections", live)):
             yield from detections
         elif self.time is None and self.find("id", live):
             yield from self._play("true_landmarks", live)
@@ -432,19 +433,20 @@ class _Match:
             ]
         is_single = self.quantity.parts == ("",) and key not in _LISTS
         more = []
-        if key == "pressure" and self._is_gauge():
-            more = ["atmosphere_pa = 0  # less than that of the air: from the surface"]
+        if key == "pressure":
+            # pressures of a stated unit that are less than half that of the air
+            factor = PRESSURES.get(self.chosen[0].unit or "", np.inf)
+            if self.values().min(initial=np.inf) * factor < 5e4:
+                text = (
+                    "atmosphere_pa = 0  # less than that of the air: from the surface"
+                )
+                more = [text]
         return [
             f"{key} = {toml_value(names[0] if is_single else names)}",
             *self._unit_line(),
             *more,
             *filter(None, [self.quantity.more]),
         ]
-
-    def _is_gauge(self) -> bool:
-        """True for pressures of a stated unit that are less than half that of the air."""
-        factor = PRESSURES.get(self.chosen[0].unit or "", np.inf)
-        return bool(self.values().min(initial=np.inf) * factor < 5e4)
 
     def _unit_line(self) -> list[str]:
         """The unit, where it is another than that of this package, or not stated."""
@@ -457,12 +459,10 @@ class _Match:
             return [line + toml_value(unit)]
         fits = self._fitting_units()
         if not fits or self._is_first(fits):
-            return [
-                f"# {line}{toml_value(list(units)[1])}  # the header states no unit"
-            ]
-        return [
-            f"{line}{toml_value(fits[0])}  # by its values; the header states no unit"
-        ]
+            usual = toml_value(list(units)[1])
+            return [f"# {line}{usual}  # the header states no unit"]
+        found = toml_value(fits[0])
+        return [f"{line}{found}  # by its values; the header states no unit"]
 
     def _geodetic(self) -> str:
         latitude, longitude = self.chosen
@@ -525,7 +525,7 @@ def _stamps(
         values = table.values([table.time])
         if np.isfinite(values).any():
             times[name] = np.unique(values[np.isfinite(values)])
-        elif not is_date(first := table.first(table.time)):
+        elif not reads_as(date_ns, first := table.first(table.time)):
             lines[name].append(
                 f"# {first!r} is no time; write such as 2026-05-01T12:30:00.25Z"
             )

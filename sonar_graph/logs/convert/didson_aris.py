@@ -96,17 +96,13 @@ class LensSonarFormat(SonarFormat):
         if content[self.signature_at : self.signature_at + 4] != self.signature:
             raise DamagedFrameError("no frame begins here")
         (number,) = struct.unpack_from("<I", content, 0)
-        clock_ns, samples, settings = self.fields(content, number)
-        size = self.head_bytes + self.beams(settings) * samples
+        clock_ns, settings = self.fields(content, number)
+        size = self.head_bytes + int(settings[0]) * int(settings[1])
         return FrameHead(at, size, number, clock_ns, settings)
 
     @abstractmethod
-    def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
-        """Time by the sonar's clock in nanoseconds, samples a beam, and settings of a frame."""
-
-    @abstractmethod
-    def beams(self, settings: Settings) -> int:
-        """Number of beams of frames with some settings."""
+    def fields(self, content: bytes, number: int) -> tuple[int, Settings]:
+        """Time by the sonar's clock in nanoseconds, and settings of a frame: beams, samples a beam, and others."""
 
     def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
         """True where some bytes can begin the frame after, by its number and signature."""
@@ -118,7 +114,7 @@ class LensSonarFormat(SonarFormat):
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
         """Image of a frame, shape (beams, bins)."""
         rows = np.frombuffer(frame, np.uint8, offset=self.head_bytes)
-        return rows.reshape(-1, self.beams(settings)).T
+        return rows.reshape(-1, int(settings[0])).T
 
 
 HEADER_BYTES = {3: (512, 256), 4: (1024, 1024)}
@@ -135,15 +131,12 @@ LOW_FREQUENCY_HZ = 1.1e6
 CLASSIC = 1
 LONG_RANGE = 2
 """Bits of a frame's configuration flags."""
-START_STEP_M = {0: 0.42, CLASSIC: 0.375, LONG_RANGE: 0.42, CLASSIC | LONG_RANGE: 0.375}
-LENGTHS_M = {
-    0: (1.25, 2.5, 5.0, 10.0, 20.0, 40.0),
-    CLASSIC: (1.125, 2.25, 4.5, 9.0, 18.0, 36.0),
-    LONG_RANGE: (2.5, 5.0, 10.0, 20.0, 40.0, 80.0),
-    CLASSIC | LONG_RANGE: (2.25, 4.5, 9.0, 18.0, 36.0, 72.0),
-}
-"""Lengths of the window by flags; low frequency begins with the third."""
+START_STEP_M = {0: 0.42, CLASSIC: 0.375}
+SHORTEST_M = {0: 1.25, CLASSIC: 1.125}
+LENGTH_CODES = 6
+"""The length of the window doubles with each code, and with the bit of the long range."""
 LOW_FREQUENCY_SHIFT = 2
+"""Low frequency begins with the third length."""
 FIRST_EXTENDED_SERIAL = 19
 LONG_RANGE_SERIAL = 15
 """Sonars of earlier serial numbers are classic whatever their flags, and one of them has a long range."""
@@ -203,8 +196,8 @@ class DidsonFormat(LensSonarFormat):
             "(Echoview's description of the format)",
         }
 
-    def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
-        """Time, samples a beam and settings: window codes, flags, beams, samples."""
+    def fields(self, content: bytes, number: int) -> tuple[int, Settings]:
+        """Time and settings: beams, samples, window codes, flags."""
         start, length = struct.unpack_from("<2i", content, 52)
         (flags,) = struct.unpack_from("<I", content, 192)
         if self._serial < FIRST_EXTENDED_SERIAL:
@@ -217,7 +210,7 @@ class DidsonFormat(LensSonarFormat):
         else:
             flags = 0
         shift = 0 if self._is_high else LOW_FREQUENCY_SHIFT
-        if not 0 <= start <= 31 or not 0 <= length < len(LENGTHS_M[flags]) - shift:
+        if not 0 <= start <= 31 or not 0 <= length < LENGTH_CODES - shift:
             raise DamagedFrameError(
                 f"frame {number} with window codes {start} and {length}"
             )
@@ -235,17 +228,12 @@ class DidsonFormat(LensSonarFormat):
                 f"frame {number} with a time that does not exist: {error}"
             ) from error
         clock_ns = round(moment.timestamp()) * 10**9 + hundredths * 10**7
-        settings = (start, length, flags, self._beams, self._samples)
-        return clock_ns, self._samples, settings
-
-    def beams(self, settings: Settings) -> int:
-        """Number of beams, the same in all frames."""
-        return int(settings[3])
+        return clock_ns, (self._beams, self._samples, start, length, flags)
 
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins that divide the window evenly."""
-        start, length, flags, beams, samples = map(int, settings)
-        step_m = START_STEP_M[flags]
+        beams, samples, start, length, flags = map(int, settings)
+        step_m = START_STEP_M[flags & CLASSIC]
         frequency_hz = HIGH_FREQUENCY_HZ
         if not self._is_high:
             # at low frequency windows begin in double steps, and the two shortest lengths are missing
@@ -254,7 +242,8 @@ class DidsonFormat(LensSonarFormat):
             frequency_hz = LOW_FREQUENCY_HZ
         # the sonar measures times: its metres hold for the nominal speed of sound
         scale = self._sound_speed_m_s / NOMINAL_SOUND_SPEED_M_S
-        bin_m = LENGTHS_M[flags][length] * scale / samples
+        doublings = length + bool(flags & LONG_RANGE)
+        bin_m = SHORTEST_M[flags & CLASSIC] * 2**doublings * scale / samples
         middles = np.arange(samples, dtype=float) + 0.5
         ranges_m = start * step_m * scale + middles * bin_m
         azimuths_rad = didson_azimuths(beams)[:: -1 if self._reverse else 1]
@@ -264,9 +253,8 @@ class DidsonFormat(LensSonarFormat):
 
 
 BEAMS_OF_PING_MODE = dict(enumerate([48] * 2 + [96] * 3 + [64] * 3 + [128] * 4, 1))
-HALF_ANGLE_DEG = 14.0
-TELEPHOTO_HALF_ANGLE_DEG = 7.0
-"""Field of view for combinations of beams and lens without a table."""
+HALF_ANGLES_DEG = (14.0, 7.0)
+"""Half the field of view without and with the telephoto lens, for numbers of beams without a table."""
 FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), 1: (1.8e6, 3.0e6), 2: (0.7e6, 1.2e6)}
 """Low and high frequency by system type: ARIS 1800, 3000, 1200."""
 SOUND_SPEEDS_M_S = (1350.0, 1650.0)
@@ -301,10 +289,10 @@ class ArisFormat(LensSonarFormat):
             "sonar.scale": f"counts 0 to 255 are 0 to {ARIS_DECIBEL_SPAN:g} dB",
         }
 
-    def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
-        """Time, samples a beam and settings.
+    def fields(self, content: bytes, number: int) -> tuple[int, Settings]:
+        """Time and settings.
 
-        These are ping mode, high frequency, sample period (µs), sound speed, samples, start delay (µs), lens, system.
+        These are beams, samples, ping mode, high frequency, sample period (µs), sound speed, start delay (µs), lens, system.
         """
         (clock_us,) = struct.unpack_from("<Q", content, 20)
         mode, high, _, _, period_us, _, _, sound_speed, samples = struct.unpack_from(
@@ -328,38 +316,21 @@ class ArisFormat(LensSonarFormat):
         refuse_header("a header", faults)
         if clock_us > LAST_US:
             raise DamagedFrameError(f"frame {number} with a time of {clock_us} us")
-        settings = (
-            mode,
-            high,
-            period_us,
-            float(sound_speed),
-            samples,
-            delay_us,
-            lens,
-            system,
-        )
-        return clock_us * 1000, samples, settings
-
-    def beams(self, settings: Settings) -> int:
-        """Number of beams by the ping mode."""
-        return BEAMS_OF_PING_MODE[int(settings[0])]
+        beams = BEAMS_OF_PING_MODE[mode]
+        way = period_us, float(sound_speed), delay_us
+        return clock_us * 1000, (beams, samples, mode, high, *way, lens, system)
 
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins by start delay, sample period and speed of sound."""
-        _, high, period_us, sound_speed, samples, delay_us, lens, system = map(
-            float, settings
-        )
-        beams = self.beams(settings)
-        telephoto = bool(lens)
-        azimuths = aris_azimuths(beams, telephoto=telephoto)
+        _, _, _, _, period_us, sound_speed, delay_us, *_ = map(float, settings)
+        beams, samples, _, high, *_, lens, system = map(int, settings)
+        azimuths = aris_azimuths(beams, telephoto=bool(lens))
         if azimuths is None:
             # the manufacturer publishes no table for this lens and number of beams
-            azimuths = even_azimuths(
-                beams, TELEPHOTO_HALF_ANGLE_DEG if telephoto else HALF_ANGLE_DEG
-            )
+            azimuths = even_azimuths(beams, HALF_ANGLES_DEG[lens])
         # half of the way of the sound, there and back
-        middles_us = delay_us + (np.arange(int(samples), dtype=float) + 0.5) * period_us
-        frequency_hz = FREQUENCIES_HZ[int(system)][int(high)]
+        middles_us = delay_us + (np.arange(samples, dtype=float) + 0.5) * period_us
+        frequency_hz = FREQUENCIES_HZ[system][high]
         return FrameGeometry(
             middles_us * _US * sound_speed / 2, azimuths, frequency_hz, sound_speed
         )

@@ -46,8 +46,7 @@ second; in microseconds it would have one a minute."""
 FIRE = struct.Struct("<5B4d")
 """Mode, rate, network speed, gamma, flags; range, gain, speed of sound, salinity."""
 RESULTS = {
-    0: struct.Struct("<2I4dIBd2H3I"),
-    1: struct.Struct("<2I4dIBd2H3I"),
+    **dict.fromkeys((0, 1), struct.Struct("<2I4dIBd2H3I")),
     2: struct.Struct("<2I8dBd2H4I3I"),
 }
 RESULT_AT = {0: 53, 1: 53, 2: 89}

@@ -32,6 +32,7 @@ Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -151,87 +152,78 @@ def planar_calibration(
     )
 
 
-class StepRun:
-    """Steps of a planar robot, and landmarks seen between them, gathered line by line.
+class StepSighting(NamedTuple):
+    """A landmark in the frame of a pose, and its equally probable identities; negative ones are left out."""
 
-    ``step_cov_places`` are the columns of the elements of a step's covariance among its last six numbers, ``body_R_file``
-    body axes (x forward, y left) from those of the file.
+    pose: int
+    """Number of steps before it."""
+    row: list[float]
+    """(x, y), and three elements of their covariance."""
+    ids: list[int]
+
+
+def sequence_of_steps(
+    name: str,
+    steps: list[list[float]],
+    seen: list[StepSighting],
+    step_cov_places: list[list[int]],
+    body_R_file: Floats,
+    notes: Mapping[str, str],
+) -> Sequence:
+    """Sequence of a run; rows at the end of each step, and at rest at 0.
+
+    The turn's noise is one density whose integral over a step has the mean variance of dθ,
+    ``sqrt(mean(c_θθ) / T)``; that of the velocity is in the rows, and in the calibration their root mean square.
+    The gyro has no bias.
+
+    ``steps``: (dx, dy, dθ) in the frame before the step, and six elements of its covariance, whose columns are
+    ``step_cov_places``; ``body_R_file``: body axes (x forward, y left) from those of the file.
     """
+    rows = np.array(steps)  # (n, 9)
+    covs = body_R_file @ rows[:, 3:][:, step_cov_places] @ body_R_file.T
+    velocity, velocity_cov, rate_rad_s = twists_of_steps(
+        rows[:, :3] @ body_R_file.T, covs
+    )
+    stamps_ns = np.arange(len(rows) + 1, dtype=np.int64) * NS_PER_S
+    # before the first step the robot rests, as uncertain as in that step
+    velocities = np.vstack([np.zeros(2), velocity])
+    velocity_covs = np.concatenate([velocity_cov[:1], velocity_cov])
+    dvl = planar_dvl(stamps_ns, velocities, velocity_covs)
+    variances = np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
+    x, y, z = np.sqrt(variances).tolist()
+    gyro_noise_density = float(np.sqrt(np.mean(covs[:, 2, 2])))
+    return Sequence(
+        name=name,
+        calibration=planar_calibration((gyro_noise_density, 0.0, 0.0), (x, y, z)),
+        imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
+        dvl=dvl,
+        detections=_detections(seen, stamps_ns, body_R_file[:2, :2]) if seen else None,
+        notes={
+            "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
+            "truth": "none",
+            "odometry": "each step as the constant twist that makes it in one second",
+        }
+        | dict(notes),
+    )
 
-    def __init__(self, step_cov_places: list[list[int]], body_R_file: Floats) -> None:
-        self._step_cov_places = step_cov_places
-        self._body_R_file = body_R_file
-        self._steps: list[list[float]] = []
-        self._seen: list[list[float]] = []
-        self._poses: list[int] = []
-        self.ids: list[list[int]] = []
-        """Equally probable identities of each landmark, length m; negative ones are left out."""
 
-    def __len__(self) -> int:
-        return len(self._steps)
-
-    def add_step(self, row: list[float]) -> None:
-        """Add (dx, dy, dθ) in the frame before the step, and six elements of its covariance."""
-        self._steps.append(row)
-
-    def add_landmark(self, row: list[float], ids: list[int]) -> None:
-        """Add (x, y) in the frame of the newest pose, and three elements of its covariance."""
-        self._seen.append(row)
-        self._poses.append(len(self))
-        self.ids.append(ids)
-
-    def sequence(self, name: str, notes: Mapping[str, str]) -> Sequence:
-        """Sequence of the run; rows at the end of each step, and at rest at 0.
-
-        The turn's noise is one density whose integral over a step has the mean variance of dθ,
-        ``sqrt(mean(c_θθ) / T)``; that of the velocity is in the rows, and in the calibration their root mean square.
-        The gyro has no bias.
-        """
-        rows = np.array(self._steps)  # (n, 9)
-        body_R_file = self._body_R_file
-        covs = body_R_file @ rows[:, 3:][:, self._step_cov_places] @ body_R_file.T
-        velocity, velocity_cov, rate_rad_s = twists_of_steps(
-            rows[:, :3] @ body_R_file.T, covs
-        )
-        stamps_ns = np.arange(len(rows) + 1, dtype=np.int64) * NS_PER_S
-        # before the first step the robot rests, as uncertain as in that step
-        velocities = np.vstack([np.zeros(2), velocity])
-        velocity_covs = np.concatenate([velocity_cov[:1], velocity_cov])
-        dvl = planar_dvl(stamps_ns, velocities, velocity_covs)
-        variances = np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)
-        x, y, z = np.sqrt(variances).tolist()
-        gyro_noise_density = float(np.sqrt(np.mean(covs[:, 2, 2])))
-        return Sequence(
-            name=name,
-            calibration=planar_calibration((gyro_noise_density, 0.0, 0.0), (x, y, z)),
-            imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
-            dvl=dvl,
-            detections=self._detections(stamps_ns) if self.ids else None,
-            notes={
-                "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
-                "truth": "none",
-                "odometry": "each step as the constant twist that makes it in one second",
-            }
-            | dict(notes),
-        )
-
-    def _detections(self, stamps_ns: Ints) -> LandmarkDetections:
-        """Landmarks as ranges and azimuths, at the end of the step before."""
-        most = max(map(len, self.ids))
-        candidate_ids = np.array([ids + [-1] * (most - len(ids)) for ids in self.ids])
-        # no identity is more probable than another
-        is_known = candidate_ids >= 0
-        id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
-        seen = np.array(self._seen)  # (m, 5)
-        # a reflection in the plane turns the sense of angles
-        plane = self._body_R_file[:2, :2]
-        point_covs = plane @ seen[:, 2:][:, POINT_COV_PLACES] @ plane.T
-        # the sonar is in the plane of the landmarks
-        points = np.pad(seen[:, :2] @ plane.T, ((0, 0), (0, 1)))
-        polar = range_and_azimuth(points, np.pad(point_covs, ((0, 0), (0, 1), (0, 1))))
-        return LandmarkDetections(
-            stamps_ns[self._poses], *polar, candidate_ids, id_probability
-        )
+def _detections(
+    seen: list[StepSighting], stamps_ns: Ints, plane: Floats
+) -> LandmarkDetections:
+    """Landmarks as ranges and azimuths, at the end of the step before; ``plane`` turns the file's axes to the body's."""
+    most = max(len(one.ids) for one in seen)
+    candidate_ids = np.array([one.ids + [-1] * (most - len(one.ids)) for one in seen])
+    # no identity is more probable than another
+    is_known = candidate_ids >= 0
+    id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
+    rows = np.array([one.row for one in seen])  # (m, 5)
+    # a reflection in the plane turns the sense of angles
+    point_covs = plane @ rows[:, 2:][:, POINT_COV_PLACES] @ plane.T
+    # the sonar is in the plane of the landmarks
+    points = np.pad(rows[:, :2] @ plane.T, ((0, 0), (0, 1)))
+    polar = range_and_azimuth(points, np.pad(point_covs, ((0, 0), (0, 1), (0, 1))))
+    poses = [one.pose for one in seen]
+    return LandmarkDetections(stamps_ns[poses], *polar, candidate_ids, id_probability)
 
 
 def read_dlr(path: Path) -> Sequence:
@@ -259,13 +251,14 @@ def read_dlr(path: Path) -> Sequence:
                 f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself"
             )
         path = path / DLR_FILE
-    run = StepRun(DLR_STEP_COV_PLACES, BODY_OF_FILE)
+    steps: list[list[float]] = []
+    seen: list[StepSighting] = []
     for place, kind, rest in _lines(path, DLR_LINES, "STEP", "LANDMARK", "LANDMARK_C"):
         if kind == "STEP":
             # the first number is that of an image
-            run.add_step(_numbers(place, rest[1:], DLR_STEP))
+            steps.append(_numbers(place, rest[1:], DLR_STEP))
             continue
-        if not len(run):
+        if not steps:
             raise DatasetError(
                 f"{place}: a landmark before the first STEP; expected {DLR_LINES}"
             )
@@ -275,17 +268,21 @@ def read_dlr(path: Path) -> Sequence:
             raise DatasetError(
                 f"{place}: {ids} are no landmark IDs; expected whole numbers after the covariances"
             )
-        run.add_landmark([x, y, *cov], list(map(int, ids)))
-    if not len(run):
+        seen.append(StepSighting(len(steps), [x, y, *cov], list(map(int, ids))))
+    if not steps:
         raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
-    without = sum(found == [-1] for found in run.ids)
-    return run.sequence(
+    without = sum(one.ids == [-1] for one in seen)
+    return sequence_of_steps(
         "dlr_spatial_cognition",
+        steps,
+        seen,
+        DLR_STEP_COV_PLACES,
+        BODY_OF_FILE,
         {
             "data set": "DLR Spatial Cognition; Kurlbaum, Frese, SFB/TR 8 report, 2009",
             "licence": "none stated",
             "noise": "the file's covariances; of the turn their mean, and not their correlation with the displacement",
-            "detections": f"{without} of {len(run.ids)} have no identity (-1)",
+            "detections": f"{without} of {len(seen)} have no identity (-1)",
         },
     )
 
@@ -318,7 +315,8 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     (6968, 3640)
     """
     path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
-    run = StepRun(PARK_STEP_COV_PLACES, np.eye(3))
+    steps: list[list[float]] = []
+    seen: list[StepSighting] = []
     newest = 0
     for place, kind, rest in _lines(path, PARK_LINES, *PARK_COLUMNS):
         start, end, *values = _numbers(place, rest, PARK_COLUMNS[kind])
@@ -330,13 +328,17 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
             )
         if kind == "ODOMETRY":
             newest = int(end)
-            run.add_step(values)
+            steps.append(values)
         else:
-            run.add_landmark(values, [int(end)])
-    if not len(run):
+            seen.append(StepSighting(len(steps), values, [int(end)]))
+    if not steps:
         raise DatasetError(f"{path}: holds no ODOMETRY line; expected {PARK_LINES}")
-    return run.sequence(
+    return sequence_of_steps(
         "victoria_park",
+        steps,
+        seen,
+        PARK_STEP_COV_PLACES,
+        np.eye(3),
         {
             "data set": "Victoria Park; Guivant, Nebot, IEEE T-RA 17(3), 2001; edge list of GTSAM's examples",
             "noise": "the file's covariances",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import bz2
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -106,7 +107,7 @@ def convert_rosbag(
     """
     with _open_bag(Path(source)) as bag, written_whole(output) as stream:
         _define(bag, _own_definitions(definitions) if definitions else {})
-        return _BagCopy(bag, LogWriter(stream)).run(progress)
+        return _copy(bag, LogWriter(stream), progress)
 
 
 @contextmanager
@@ -179,39 +180,34 @@ def limited_bz2(packed: bytes) -> bytes:
     return _unpacked(bz2.BZ2Decompressor(), packed)
 
 
+def limited_lz4(packed: bytes) -> bytes:
+    """Content of an lz4 chunk; a LogError as of `limited_bz2`."""
+    return _unpacked(lz4.frame.LZ4FrameDecompressor(), packed)
+
+
 def limited_zstd(packed: bytes) -> bytes:
     """Content of a zstd chunk or message; a LogError as of `limited_bz2`."""
     return _unpacked(import_module(_ZSTD).ZstdDecompressor(), packed)
 
 
 def _unpacked(chunk: Any, packed: bytes) -> bytes:
-    return _whole(chunk.decompress(packed, LARGEST_BYTES + 1), is_whole=chunk.eof)
-
-
-def limited_lz4(packed: bytes) -> bytes:
-    """Content of an lz4 chunk; a LogError where it is cut off or has more than `LARGEST_BYTES`."""
-    chunk = lz4.frame.LZ4FrameDecompressor()
     content = bytearray()
-    # in pieces: the decompressor reserves as much memory as it is allowed to fill
+    # in pieces: the decompressor of lz4 reserves as much memory as it is allowed to fill
     while not chunk.eof and len(content) <= LARGEST_BYTES:
-        part = chunk.decompress(packed, max_length=_PIECE_BYTES)
+        part = chunk.decompress(packed, _PIECE_BYTES)
         if not part and chunk.needs_input:
             break
         content += part
         # the decompressor keeps what it has not used
         packed = b""
-    return _whole(bytes(content), is_whole=chunk.eof)
-
-
-def _whole(content: bytes, *, is_whole: bool) -> bytes:
     if len(content) > LARGEST_BYTES:
         raise LogError(
             f"a chunk of the bag has more than {LARGEST_BYTES} bytes, which is too much at once: `rosbag decompress` "
             "and `rosbag filter`, or `ros2 bag convert`, write smaller chunks"
         )
-    if not is_whole:
+    if not chunk.eof:
         raise LogError("a chunk is cut off")
-    return content
+    return bytes(content)
 
 
 @contextmanager
@@ -361,100 +357,79 @@ class Ros1InMcap:
                 yield connection, message.log_time, message.data
 
 
-class _BagCopy:
-    """Copy of the messages of a bag to a log."""
+def _copy(
+    bag: AnyReader | Ros1InMcap, writer: LogWriter, progress: Progress | None
+) -> BagConversion:
+    """Copy the messages of a bag to a log."""
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import Stores, get_typestore
 
-    def __init__(self, bag: AnyReader | Ros1InMcap, writer: LogWriter) -> None:
-        from rosbags.typesys import Stores, get_typestore
+    store = get_typestore(Stores.ROS2_JAZZY)
+    # of types that both define, that of Jazzy counts: readers of the log know it
+    known = bag.typestore.fielddefs
+    _add_types(store, known)
+    connections = [c for c in bag.connections if c.msgtype in known]
+    left_out = {
+        c.topic: f"{c.msgtype} is not defined in the bag: add --definitions FOLDER, which holds {c.msgtype}.msg"
+        for c in bag.connections
+        if c not in connections
+    }
+    # numbers of connections repeat in the files of a bag that is split
+    channels = {(c.id, id(c.owner)): _channel(c, store, writer) for c in connections}
+    recoders = {
+        kind: _recoder(kind, bag, store) for kind in {c.msgtype for c in connections}
+    }
+    conversion = BagConversion(
+        len({c.topic for c in connections}),
+        duration_s=bag.duration * 1e-9,
+        left_out=left_out,
+    )
+    broken: Counter[str] = Counter()
+    total = sum(c.msgcount for c in connections)
+    # without connections the library would give the messages of all
+    messages = bag.messages(connections=connections) if connections else ()
+    for number, (connection, time_ns, raw) in enumerate(messages):
+        try:
+            payload = bytes(recoders[connection.msgtype](raw))
+        except SerdeError:
+            broken[connection.topic] += 1
+            continue
+        channel = channels[connection.id, id(connection.owner)]
+        writer.mcap.add_message(channel, time_ns, payload, time_ns)
+        conversion.messages += 1
+        if progress and number % _STEPS == 0:
+            progress(number, total)
+    for topic, count in broken.items():
+        left_out[topic] = f"{count} messages are not of their type"
+    writer.finish()
+    return conversion
 
-        self._bag = bag
-        self._writer = writer
-        self._store = get_typestore(Stores.ROS2_JAZZY)
-        # of types that both define, that of Jazzy counts: readers of the log know it
-        _add_types(self._store, bag.typestore.fielddefs)
-        self._recoders: dict[str, Recode] = {}
 
-    def run(self, progress: Progress | None) -> BagConversion:
-        from rosbags.serde import SerdeError
+def _channel(connection: Connection, store: Typestore, writer: LogWriter) -> int:
+    """Channel of a connection.
 
-        bag = self._bag
-        writer = self._writer
-        known = bag.typestore.fielddefs
-        connections = [c for c in bag.connections if c.msgtype in known]
-        missing = {
-            c.topic: f"{c.msgtype} is not defined in the bag: add --definitions FOLDER, which holds {c.msgtype}.msg"
-            for c in bag.connections
-            if c not in connections
-        }
-        # numbers of connections repeat in the files of a bag that is split
-        channels = {(c.id, id(c.owner)): self._channel(c) for c in connections}
-        conversion = BagConversion(
-            len({c.topic for c in connections}),
-            duration_s=bag.duration * 1e-9,
-            left_out=missing,
-        )
-        broken: dict[str, int] = {}
-        total = sum(c.msgcount for c in connections)
-        # without connections the library would give the messages of all
-        messages = bag.messages(connections=connections) if connections else ()
-        for number, (connection, time_ns, raw) in enumerate(messages):
-            try:
-                payload = bytes(self._recoders[connection.msgtype](raw))
-            except SerdeError:
-                broken[connection.topic] = broken.get(connection.topic, 0) + 1
-                continue
-            writer.mcap.add_message(
-                channels[connection.id, id(connection.owner)], time_ns, payload, time_ns
-            )
-            conversion.messages += 1
-            if progress and number % _STEPS == 0:
-                progress(number, total)
-        conversion.left_out |= {
-            topic: f"{n} messages are not of their type" for topic, n in broken.items()
-        }
-        writer.finish()
-        return conversion
+    Late subscribers get the last message where the connection is ``latching`` in ROS 1, "transient local" in ROS 2.
+    """
+    from rosbags.interfaces import ConnectionExtRosbag2
 
-    def _channel(self, connection: Connection) -> int:
-        """Channel of a connection, and the conversion of its messages.
+    type_name = _RENAMED.get(connection.msgtype, connection.msgtype)
+    text, _ = store.generate_msgdef(type_name, ros_version=2)
+    if isinstance(connection.ext, ConnectionExtRosbag2):
+        profiles = connection.ext.offered_qos_profiles
+        is_latched = any(one.durability.value == 1 for one in profiles)
+    else:
+        is_latched = bool(connection.ext.latching)
+    schema = SchemaText(type_name, "ros2msg", text.encode())
+    return writer.channel(connection.topic, schema, metadata=latched(is_latched))
 
-        Late subscribers get the last message where the connection is ``latching`` in ROS 1, "transient local" in ROS 2.
-        """
-        from rosbags.interfaces import ConnectionExtRosbag2
 
-        type_name = _RENAMED.get(connection.msgtype, connection.msgtype)
-        self._recoders[connection.msgtype] = self._recoder(
-            connection.msgtype, type_name
-        )
-        text, _ = self._store.generate_msgdef(type_name, ros_version=2)
-        if isinstance(connection.ext, ConnectionExtRosbag2):
-            profiles = connection.ext.offered_qos_profiles
-            is_latched = any(one.durability.value == 1 for one in profiles)
-        else:
-            is_latched = bool(connection.ext.latching)
-        schema = SchemaText(type_name, "ros2msg", text.encode())
-        return self._writer.channel(
-            connection.topic, schema, metadata=latched(is_latched)
-        )
+def _recoder(own: str, bag: AnyReader | Ros1InMcap, store: Typestore) -> Recode:
+    """Conversion of payloads of a type in the bag to CDR of the type as the log defines it."""
+    from rosbags.convert.converter import is_same_wireformat, migrate_bytes
 
-    def _recoder(self, own: str, type_name: str) -> Recode:
-        """Conversion of a payload in the bag to CDR of the type as the log defines it."""
-        from rosbags.convert.converter import is_same_wireformat, migrate_bytes
-
-        store: Typestore = self._bag.typestore
-        is2 = self._bag.is2
-        if not is_same_wireformat(store, self._store, own, type_name):
-            return partial(
-                migrate_bytes,
-                store,
-                self._store,
-                own,
-                type_name,
-                {},
-                src_is2=is2,
-                dst_is2=True,
-            )
+    type_name = _RENAMED.get(own, own)
+    if is_same_wireformat(bag.typestore, store, own, type_name):
         # CDR of the same fields needs no change
-        if is2:
-            return memoryview
-        return partial(self._store.ros1_to_cdr, typename=type_name)
+        return memoryview if bag.is2 else partial(store.ros1_to_cdr, typename=type_name)
+    kinds = bag.typestore, store, own, type_name
+    return partial(migrate_bytes, *kinds, {}, src_is2=bag.is2, dst_is2=True)

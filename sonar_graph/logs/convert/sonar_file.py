@@ -11,11 +11,10 @@ import json
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import chain, combinations, repeat
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,15 +152,8 @@ class ByteSource:
         except OSError as error:
             raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._stream.close()
 
     def read(self, at: int, count: int) -> bytes:
@@ -389,7 +381,7 @@ def convert_sonar_file(
     progress: Progress | None = None,
 ) -> SonarConversion:
     """Write all whole frames to an MCAP log; memory holds a few of them at a time."""
-    with ByteSource(Path(path)) as source:
+    with closing(ByteSource(Path(path))) as source:
         return _convert(source, open_format(source), Path(output), progress)
 
 

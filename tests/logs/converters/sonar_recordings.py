@@ -76,47 +76,21 @@ class Ddf(Recorded):
     def file_header(self) -> bytes:
         count, beams, samples = self.frames.shape
         header = bytearray(512 if self.version == 3 else 1024)
-        put(header, 0, "3sB", b"DDF", self.version)
-        put(
-            header,
-            4,
-            "4i",
-            count if self.promised is None else self.promised,
-            8,
-            self.high,
-            beams,
-        )
+        promised = count if self.promised is None else self.promised
+        put(header, 0, "3sB4i", b"DDF", self.version, promised, 8, self.high, beams)
         put(header, 20, "fi", 400_000.0, samples)
-        put(
-            header,
-            28,
-            "5i",
-            20,
-            self.start_code,
-            self.length_code,
-            self.reverse,
-            self.serial,
-        )
-        put(header, 48, "32s", b"2014-05-06")
+        window = self.start_code, self.length_code
+        put(header, 28, "5i32s", 20, *window, self.reverse, self.serial, b"2014-05-06")
         return bytes(header)
 
     def frame(self, i: int) -> bytes:
         header = bytearray(256 if self.version == 3 else 1024)
         moment = START + i * STEP
-        put(header, 0, "i", i)
         # the computer's clock is 7 s ahead
-        put(header, 4, "2i", int(moment.timestamp()) + 7, 0)
+        put(header, 0, "3i", i, int(moment.timestamp()) + 7, 0)
         put(header, 12, "4s", self.frame_version or b"DDF" + bytes([self.version]))
-        put(header, 20, "3i", moment.year, moment.month, moment.day)
-        put(
-            header,
-            32,
-            "4i",
-            moment.hour,
-            moment.minute,
-            moment.second,
-            moment.microsecond // 10_000,
-        )
+        hundredths = moment.microsecond // 10_000
+        put(header, 20, "7i", *moment.timetuple()[:6], hundredths)
         put(header, 48, "3i", 3, self.start_code, self.length_code)
         put(header, 192, "i", self.flags)
         return bytes(header) + self.frames[i].T.tobytes()  # beams fastest
@@ -146,9 +120,9 @@ class Aris(Recorded):
         put(header, 0, "IQ4sIQ", i, clock_us + 7_000_000, b"DDF\x05", 0, clock_us)
         put(header, 128, "f", 1.5 + i)
         put(header, 160, "f", 90.0 - i)
-        put(header, 436, "6I", self.mode, self.high, 12, 30_000, self.period_us, 1)
         speed = self.sound_speeds[i] if self.sound_speeds else self.sound_speed
-        put(header, 460, "2fI", 8.3, speed, self.frames.shape[2])
+        ping = self.mode, self.high, 12, 30_000, self.period_us, 1
+        put(header, 436, "6I2fI", *ping, 8.3, speed, self.frames.shape[2])
         put(header, 476, "3I", self.delay_us, self.telephoto, self.system)
         put(header, 516, "I", self.in_order)
         return bytes(header) + self.frames[i].T.tobytes()

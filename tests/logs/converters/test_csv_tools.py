@@ -19,20 +19,25 @@ EPOCH_S = 1_777_638_600.0
 
 
 def dive(imu_hz: float = 50.0, every: int = 10) -> SimpleNamespace:
-    """Rates, forces, velocities, depths and bearings of a dive; the Doppler log has every n-th time of the IMU."""
+    """Rates and forces of a dive; its Doppler log, depths and bearings have every n-th time of the IMU."""
     rng = np.random.default_rng(7)
     s = np.arange(ROWS) / imu_hz
+    slow = s[::every]
+    turns = np.sin(slow), np.cos(slow), np.sin(2 * slow)
     return SimpleNamespace(
         s=s,
-        slow=slice(0, ROWS, every),
+        slow=slow,
         rate=rng.normal(0, 0.1, (ROWS, 3)),
         force=rng.normal([0, 0, 9.81], 0.05, (ROWS, 3)),
-        velocity=np.column_stack(
-            [0.8 + 0.3 * np.sin(s), 0.1 * np.cos(s), 0.05 * np.sin(2 * s)]
-        ),
-        depth=4 + np.sin(0.3 * s),
-        bearing=(300 + 40 * np.sin(0.5 * s)) % 360,
+        velocity=np.column_stack(turns) * [0.3, 0.1, 0.05] + [0.8, 0, 0],
+        depth=4 + np.sin(0.3 * slow),
+        bearing=(300 + 40 * np.sin(0.5 * slow)) % 360,
     )
+
+
+@pytest.fixture
+def d() -> SimpleNamespace:
+    return dive()
 
 
 def write(
@@ -88,12 +93,8 @@ def assert_is(sequence, dive: SimpleNamespace, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(
         sequence.imu.angular_velocity, dive.rate, rtol=0, atol=atol
     )
-    np.testing.assert_allclose(
-        sequence.dvl.velocity, dive.velocity[dive.slow], rtol=0, atol=atol
-    )
-    np.testing.assert_allclose(
-        -sequence.depth.z_m, dive.depth[dive.slow], rtol=0, atol=atol
-    )
+    np.testing.assert_allclose(sequence.dvl.velocity, dive.velocity, rtol=0, atol=atol)
+    np.testing.assert_allclose(-sequence.depth.z_m, dive.depth, rtol=0, atol=atol)
 
 
 @pytest.fixture
@@ -103,96 +104,86 @@ def folder(tmp_path):
     return folder
 
 
-def plain(folder: Path, d: SimpleNamespace, *names: str, scale: float = 1.0) -> None:
+def plain(
+    folder: Path,
+    d: SimpleNamespace,
+    *names: str,
+    scale: float = 1.0,
+    start_s: float = 0.0,
+) -> None:
     """The tables of a dive that a test does not write in its own way."""
-    k = d.slow
-    t = np.round(d.s * scale, 9)
+    t, slow = (np.round((start_s + s) * scale, 9) for s in (d.s, d.slow))
     if "imu" in names:
         header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
         write(folder / "imu.csv", header, t, *d.rate.T, *d.force.T)
     if "dvl" in names:
-        write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", t[k], *d.velocity[k].T)
+        write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", slow, *d.velocity.T)
     if "depth" in names:
-        write(folder / "depth.csv", "time,depth", t[k], d.depth[k])
+        write(folder / "depth.csv", "time,depth", slow, d.depth)
 
 
-def test_excel_in_german_with_semicolons_decimal_commas_and_degree_signs(
-    folder, tmp_path
-):
-    d = dive()
-    k = d.slow
+def comma(value: float) -> str:
+    return repr(value).replace(".", ",")
 
-    def comma(value: float) -> str:
-        return repr(value).replace(".", ",")
 
-    how = {"sep": ";", "number": comma, "encoding": "cp1252"}
-    stamps = dates(d.s, "%d.%m.%Y %H:%M:%S,@")
-    header = '"Zeit";"Gyro X (°/s)";"Gyro Y (°/s)";"Gyro Z (°/s)";"Acc X [g]";"Acc Y [g]";"Acc Z [g]"'
-    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665).T)
-    write(folder / "imu.csv", header, stamps, *columns, **how)
-    header = '"Zeit";"Vel X [cm/s]";"Vel Y [cm/s]";"Vel Z [cm/s]";"Tiefe [m]"'
-    columns = (*(100 * d.velocity[k]).T, d.depth[k])
-    write(folder / "dvl.csv", header, stamps[k], *columns, **how)
-    _, config = template(folder)
-    assert (config["imu"]["decimal"], config["imu"]["encoding"]) == (",", "cp1252")
+TOOLS = {
+    "Excel in German": (
+        '"Zeit";"Gyro X (°/s)";"Gyro Y (°/s)";"Gyro Z (°/s)";"Acc X [g]";"Acc Y [g]";"Acc Z [g]"',
+        '"Zeit";"Vel X [cm/s]";"Vel Y [cm/s]";"Vel Z [cm/s]";"Tiefe [m]"',
+        "%d.%m.%Y %H:%M:%S,@",
+        (1 / 9.80665, 100, 1),
+        {"sep": ";", "number": comma, "encoding": "cp1252"},
+    ),
+    "writetable of MATLAB": (
+        "Time,gyro_x_deg_s_,gyro_y_deg_s_,gyro_z_deg_s_,acc_x_m_s2_,acc_y_m_s2_,acc_z_m_s2_",
+        "Time,vel_x_mm_s_,vel_y_mm_s_,vel_z_mm_s_,depth_m_",
+        "%d-%b-%Y %H:%M:%S.@",
+        (1, 1000, 1),
+        {},
+    ),
+    "a second line with units": (
+        "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg",
+        "Time;VelX;VelY;VelZ;Depth\nms;mm/s;mm/s;mm/s;cm",
+        None,
+        (1 / 9.80665e-3, 1000, 100),
+        {"sep": ";"},
+    ),
+}
+"""Headers of IMU and Doppler log, dates, factors of forces, velocities and depths, and form; rates are in degrees."""
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool, d):
+    of_imu, of_dvl, form, (force, velocity, depth), how = TOOLS[tool]
+    stamps, slow = (1e3 * s if form is None else dates(s, form) for s in (d.s, d.slow))
+    columns = (*np.degrees(d.rate).T, *(force * d.force).T)
+    write(folder / "imu.csv", of_imu, stamps, *columns, **how)
+    columns = (*(velocity * d.velocity).T, depth * d.depth)
+    write(folder / "dvl.csv", of_dvl, slow, *columns, **how)
+    imu = template(folder)[1]["imu"]
+    if "encoding" in how:
+        assert (imu["decimal"], imu["encoding"]) == (",", "cp1252")
     assert_is(guessed(folder, tmp_path), d)
-
-
-def test_matlab_writetable_with_its_dates_and_mangled_units(folder, tmp_path):
-    d = dive()
-    k = d.slow
-    stamps = dates(d.s, "%d-%b-%Y %H:%M:%S.@")
-    header = "Time,gyro_x_deg_s_,gyro_y_deg_s_,gyro_z_deg_s_,acc_x_m_s2_,acc_y_m_s2_,acc_z_m_s2_"
-    write(folder / "imu.txt", header, stamps, *np.degrees(d.rate).T, *d.force.T)
-    header = "Time,vel_x_mm_s_,vel_y_mm_s_,vel_z_mm_s_,depth_m_"
-    columns = (*(1000 * d.velocity[k]).T, d.depth[k])
-    write(folder / "dvl.txt", header, stamps[k], *columns)
-    assert_is(guessed(folder, tmp_path), d)
-
-
-def test_linkquest_navquest_whose_flag_marks_rows_without_lock(folder, tmp_path):
-    d = dive()
-    plain(folder, d, "imu", "depth")
-    k = d.slow
-    flag = np.ones(ROWS)[k]
-    flag[20:30] = 0
-    velocity = np.round(1000 * d.velocity[k]) * flag[:, None]
-    header = "time velo_x velo_y velo_z velo_flag altitude"
-    columns = (d.s[k], *velocity.T, flag, np.full(len(flag), 12.5))
-    write(folder / "navquest.txt", header, *columns, sep=" ")
-    assert template(folder)[1]["dvl"]["scale"] == "mm/s"
-    sequence = guessed(folder, tmp_path)
-    assert len(sequence.dvl) == len(flag) - 10
-    np.testing.assert_allclose(
-        sequence.dvl.velocity, d.velocity[k][flag == 1], atol=1e-3
-    )
 
 
 def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
     d = dive(imu_hz=10.0, every=1)
     stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@")
-    header = "Timestamp,roll,pitch,heading,rollRate,pitchRate,yawRate,groundSpeed,altitudeRelative,battery0.id"
+    header = "Timestamp,heading,rollRate,pitchRate,yawRate,groundSpeed,battery0.id"
     flat = np.zeros(ROWS)
-    columns = (*d.rate.T, *np.degrees(d.rate).T, flat, -d.depth, flat)
-    columns = (columns[0], columns[1], d.bearing, *columns[3:])
+    columns = d.bearing, *np.degrees(d.rate).T, flat, flat
     write(folder / "vehicle.csv", header, stamps, *columns)
-    seconds = EPOCH_S + d.s
-    write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", seconds, *d.velocity.T)
+    plain(folder, d, "dvl", start_s=EPOCH_S)
     text, config = template(folder)
-    assert "imu" not in config
-    assert "# [imu]  # no accelerometer: is this the IMU?" in text
-    assert config["heading"]["scale"] == "deg"
     # the battery has an identity
-    assert "true_landmarks" not in config
+    assert config.keys() == {"dvl", "heading"}
+    assert config["heading"]["scale"] == "deg"
+    assert "# [imu]  # no accelerometer: is this the IMU?" in text
     with pytest.raises(LogError, match=r"has no table \[imu\]"):
         guessed(folder, tmp_path)
-    taken = uncommented(text, "imu").replace(
-        'angular_velocity_scale = "deg/s"', 'angular_velocity_scale = "deg/s"\n'
-    )
-    taken = taken.replace(
-        '# angular_velocity_scale = "deg/s"', 'angular_velocity_scale = "deg/s"'
-    )
-    sequence = guessed(folder, tmp_path, taken)
+    unit = 'angular_velocity_scale = "deg/s"'
+    taken = uncommented(text, "imu").replace(f"# {unit}", unit)
+    sequence = guessed(folder, tmp_path, taken.replace(unit, f"{unit}\n"))
     np.testing.assert_allclose(sequence.imu.angular_velocity, d.rate, atol=1e-9)
     assert np.isnan(sequence.imu.specific_force).all()
     expected = np.unwrap(np.radians(90 - d.bearing))
@@ -204,9 +195,8 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
 def test_units_of_times_follow_from_the_sensors_rates(
     folder, tmp_path, imu_hz, every, scale
 ):
-    d = dive(imu_hz, every)
     # enough rows of the Doppler log for a rate
-    d.slow = slice(0, ROWS, every // 4)
+    d = dive(imu_hz, every // 4)
     plain(folder, d, "imu", "dvl", "depth", scale=scale)
     sequence = guessed(folder, tmp_path)
     assert sequence.duration_s == pytest.approx(d.s[-1], rel=0.1)
@@ -216,9 +206,8 @@ def test_units_of_times_follow_from_the_sensors_rates(
 
 
 def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(
-    folder, tmp_path
+    folder, tmp_path, d
 ):
-    d = dive()
     plain(folder, d, "imu", "dvl", "depth", scale=1e3)
     for path in folder.iterdir():
         path.write_text(path.read_text().replace("time", "time [s]"))
@@ -235,8 +224,7 @@ def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(
         ("heading", "time,yaw"),
     ],
 )
-def test_a_column_that_never_changes_is_no_motion(folder, name, header):
-    d = dive()
+def test_a_column_that_never_changes_is_no_motion(folder, name, header, d):
     plain(folder, d, "imu", "dvl", "depth")
     count = header.count(",")
     write(folder / f"{name}.csv", header, d.s, *np.full((count, ROWS), 0.5))
@@ -248,38 +236,21 @@ def test_a_column_that_never_changes_is_no_motion(folder, name, header):
 # --- tables of other tools, and what they must not be taken for -------------------------------------------------------
 
 
-def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path):
-    d = dive()
+def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path, d):
     plain(folder, d, "imu", "dvl")
-    k = d.slow
-    decibar = d.depth[k] * 9.80665 / 10
-    write(folder / "ctd.csv", "time;Pressure (dbar)", d.s[k], decibar, sep=";")
+    decibar = d.depth * 9.80665 / 10
+    write(folder / "ctd.csv", "time;Pressure (dbar)", d.slow, decibar, sep=";")
     depth_m = -guessed(folder, tmp_path).depth.z_m
-    np.testing.assert_allclose(depth_m, d.depth[k], rtol=5e-3)
+    np.testing.assert_allclose(depth_m, d.depth, rtol=5e-3)
 
 
-def test_a_second_line_of_the_header_with_units(folder, tmp_path):
-    d = dive()
-    k = d.slow
-    header = "Time;GyrX;GyrY;GyrZ;AccX;AccY;AccZ\nms;deg/s;deg/s;deg/s;mg;mg;mg"
-    columns = (*np.degrees(d.rate).T, *(d.force / 9.80665e-3).T)
-    write(folder / "imu.csv", header, 1e3 * d.s, *columns, sep=";")
-    header = "Time;VelX;VelY;VelZ\nms;mm/s;mm/s;mm/s"
-    write(folder / "dvl.csv", header, 1e3 * d.s[k], *(1e3 * d.velocity[k]).T, sep=";")
-    header = "Time;Depth\nms;cm"
-    write(folder / "depth.csv", header, 1e3 * d.s[k], 100 * d.depth[k], sep=";")
-    assert_is(guessed(folder, tmp_path), d)
-
-
-def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
-    d = dive()
-    k = d.slow
+def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path, d):
     paths = [f"/imu/{kind}/{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz"]  # fmt: skip
     header = ",".join(["__time", *paths])
     write(folder / "imu.csv", header, EPOCH_S + d.s, *d.rate.T, *d.force.T)
-    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.s[k]]
+    ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.slow]
     header = "%time,field.header.frame_id,field.velocity.x,field.velocity.y,field.velocity.z,field.depth"
-    columns = (ns, ["dvl"] * len(ns), *d.velocity[k].T, d.depth[k])
+    columns = (ns, ["dvl"] * len(ns), *d.velocity.T, d.depth)
     write(folder / "dvl.csv", header, *columns)
     assert_is(guessed(folder, tmp_path), d)
 
@@ -291,8 +262,7 @@ def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path):
         "%H:%M:%S.@",
     ],
 )
-def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form):
-    d = dive()
+def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form, d):
     plain(folder, d, "dvl", "depth")
     header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
     write(folder / "imu.csv", header, dates(d.s, form), *d.rate.T, *d.force.T)
@@ -300,38 +270,40 @@ def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, fo
         guessed(folder, tmp_path)
 
 
-def test_numbers_with_thousands_separators_are_refused(folder, tmp_path):
-    d = dive()
+def test_numbers_with_thousands_separators_are_refused(folder, tmp_path, d):
     plain(folder, d, "imu", "dvl")
-    k = d.slow
-    cells = [f"{depth:,.1f}" for depth in 1000 * d.depth[k]]
-    write(folder / "depth.csv", "time;depth [mm]", d.s[k], cells, sep=";")
+    cells = [f"{depth:,.1f}" for depth in 1000 * d.depth]
+    write(folder / "depth.csv", "time;depth [mm]", d.slow, cells, sep=";")
     with pytest.raises(
         LogError, match=r"depth\.csv, line 2: .*'4,000\.0' is no number"
     ):
         guessed(folder, tmp_path)
 
 
+@pytest.mark.parametrize(("name", "held"), [("velocity_valid", 1), ("velo_flag", 0)])
 def test_a_column_of_validity_is_proposed_and_missed_where_it_is_not_used(
-    folder, tmp_path
+    folder, tmp_path, name, held, d
 ):
-    d = dive()
+    """By its name, or by velocities that are zero in the marked rows; the header has no unit."""
     plain(folder, d, "imu", "depth")
-    k = d.slow
-    marks = ["false" if 10 <= row < 20 else "true" for row in range(len(d.s[k]))]
-    header = "time,vel_x,vel_y,vel_z,velocity_valid"
-    write(folder / "dvl.csv", header, d.s[k], *d.velocity[k].T, marks)
+    is_lost = np.isin(np.arange(len(d.slow)), range(10, 20))
+    velocity = 1000 * d.velocity * np.where(is_lost, held, 1)[:, None]
+    marks = np.where(is_lost, "false", "true").tolist()
+    header = f"time,vel_x,vel_y,vel_z,{name}"
+    write(folder / "dvl.csv", header, d.slow, *velocity.T, marks)
     config = template(folder)[1]
-    assert config["dvl"]["valid_where"] == {"velocity_valid": 1}
-    assert len(guessed(folder, tmp_path).dvl) == len(marks) - 10
+    assert config["dvl"]["valid_where"] == {name: 1}
+    assert config["dvl"]["scale"] == "mm/s"
+    found = guessed(folder, tmp_path).dvl.velocity
+    np.testing.assert_allclose(found, d.velocity[~is_lost], atol=1e-9)
     del config["dvl"]["valid_where"]
     warning = read_csv(folder, config).notes["csv.warnings"]
-    assert "column velocity_valid is 0 in 10 of 60 rows and not used" in warning
-    assert "`valid_where = {velocity_valid = 1}`" in warning
+    assert f"column {name} is 0 in 10 of 60 rows and not used" in warning
+    assert f"`valid_where = {{{name} = 1}}`" in warning
 
 
-def test_a_sonar_without_identities_states_it_by_false(folder):
-    plain(folder, dive(), "imu", "dvl")
+def test_a_sonar_without_identities_states_it_by_false(folder, d):
+    plain(folder, d, "imu", "dvl")
     (folder / "seen.csv").write_text("time,range,azimuth\n1.0,3.0,0.1\n2.0,3.0,0.2\n")
     config = template(folder)[1]
     assert config["detections"]["ids"] is False

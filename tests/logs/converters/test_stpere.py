@@ -80,21 +80,13 @@ def test_axes_units_and_biases_are_those_found_in_the_data(folder):
 
 
 def test_a_missing_file_or_folder_is_named(folder):
-    with pytest.raises(
-        DatasetError,
-        match=r"absent: is not a folder; .* MTI\.log, DVL\.log, DGPS\.log$",
-    ):
+    told = r"absent: is not a folder; .* MTI\.log, DVL\.log, DGPS\.log$"
+    with pytest.raises(DatasetError, match=told):
         read_stpere(folder / "absent")
     (folder / "DVL.log").unlink()
-    with pytest.raises(
-        DatasetError,
-        match=rf"{folder.name}: holds no DVL\.log; give the folder that holds MTI",
-    ):
+    told = rf"{folder.name}: holds no DVL\.log; give the folder that holds MTI"
+    with pytest.raises(DatasetError, match=told):
         read_stpere(folder)
-    (folder / "MTI.log").rename(folder / "mti.txt")
-    with pytest.raises(DatasetError, match=r"holds no MTI\.log, DVL\.log; give"):
-        read_stpere(folder)
-    (folder / "mti.txt").rename(folder / "MTI.log")
     (folder / "DVL.log").mkdir()
     with pytest.raises(DatasetError, match=r"DVL\.log: holds no files"):
         read_stpere(folder)
