@@ -163,15 +163,10 @@ def circle_calibration(**imu_noise):
     )
 
 
-def circle(gyro_error=0.0, velocity_error=0.0, seconds=CIRCLE_S):
+def circle(seconds=CIRCLE_S):
     """A level circle; the DVL off the centre of the body, the accelerometer silent."""
     velocity = np.array([SPEED, 0.0, 0.0]) + np.cross([0.0, 0.0, YAW_RATE], LEVER)
-    gyro = imu(seconds, (0.0, 0.0, YAW_RATE), NO_FORCE)
-    doppler = dvl(seconds, velocity)
-    return (
-        replace(gyro, angular_velocity=gyro.angular_velocity + gyro_error),
-        replace(doppler, velocity=doppler.velocity + velocity_error),
-    )
+    return imu(seconds, (0.0, 0.0, YAW_RATE), NO_FORCE), dvl(seconds, velocity)
 
 
 def in_a_gap(depth=None, detections=None):

@@ -1,6 +1,5 @@
 """Laws of headings and position fixes in the filters, in gaps and late."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -30,10 +29,8 @@ from .runs import (
 def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind, is_late):
     """Ten fixes at 9 s of a gap constrain the start somewhat less than an exact one; a heading is as good as elsewhere."""
     fixes_ns = later(*np.linspace(9.0, 9.9, 10))
-    unknown = np.full((10, 3, 3), math.nan)
-    fixes = PositionFixes(
-        fixes_ns, np.zeros((10, 3)), np.where(np.isnan(unknown), 1e-8 * np.eye(3), 0.0)
-    )
+    covs = np.tile(1e-8 * np.eye(3), (10, 1, 1))
+    fixes = PositionFixes(fixes_ns, np.zeros((10, 3)), covs)
     sequence = replace(in_a_gap(), positions=None if is_late else fixes)
     slam = begun(kind, sequence.calibration)
     for window in sequence.replay(later(8.0, 9.95)):
@@ -120,14 +117,6 @@ def on_a_winding_way(kind, *cuts):
     )
 
 
-def fix_at(second, position_m, sigma_m=0.01):
-    return PositionFixes(
-        np.array([later(second)]),
-        np.reshape(position_m, (1, 3)),
-        sigma_m**2 * np.eye(3)[None],
-    )
-
-
 def means_and_covariance(slam):
     """What the filter expects, as one row, and its covariance."""
     if isinstance(slam, EkfSlam):
@@ -150,9 +139,10 @@ def assert_moved_by_a_late_fix(slam, late_s, now_s, *, is_used):
     said = slam.trajectory()
     mean, P = means_and_covariance(slam)
     (then,) = np.flatnonzero(said.stamps_ns == later(late_s))
-    slam.process(
-        Measurements(later(now_s), positions=fix_at(late_s, said.positions[then]))
+    fix = PositionFixes(
+        np.array([later(late_s)]), said.positions[[then]], 1e-4 * np.eye(3)[None]
     )
+    slam.process(Measurements(later(now_s), positions=fix))
     mean_after, P_after = means_and_covariance(slam)
     assert [row.reason for row in slam.refused_rows()] == [Refusal.LATE] * (not is_used)
     assert_allclose(mean_after, mean, atol=1e-4 if is_used else 0.0)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines import ekf_slam, invariant_ekf
 from baselines.kalman import USED
-from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
+from sonar_graph.calibration import PlanarMotion, Start
 from sonar_graph.models import locate, range_azimuth
 from sonar_graph.navigation import Odometry
 from sonar_graph.testing.numerical import central_differences
@@ -22,7 +22,6 @@ from .filters import (
     NOTHING,
     PORT,
     STILL,
-    Ekf,
     Invariant,
     attitudes,
     begun,
@@ -254,11 +253,10 @@ def test_a_new_landmark_has_the_numerical_covariance_and_correlations(
 
 
 @both
-def test_depth_up_and_plane_are_scalar_kalman_updates(filter_):
+def test_up_and_plane_are_scalar_kalman_updates(filter_):
     """At the origin and level: ``1 / P' = 1 / P + 1 / R``, and the estimate moves by ``P / (P + R)``."""
     start = Start(rpy_sigma_rad=(0.1, 0.2, 0.3), position_sigma_m=(0.1, 0.2, 0.5))
-    depth = DepthCalibration()
-    calibration = CALIBRATION.model_copy(update={"start": start, "depth": depth})
+    calibration = CALIBRATION.model_copy(update={"start": start})
     roll, pitch, _, _, _, z = np.square((*start.rpy_sigma_rad, *start.position_sigma_m))
     still = motion_of(np.zeros(6), np.zeros((6, 6)), np.zeros((6, 3)))
 
@@ -268,10 +266,6 @@ def test_depth_up_and_plane_are_scalar_kalman_updates(filter_):
         R, X, cov = slam.pose_after(still)
         return gtsam.Rot3(R).rpy(), X, np.diag(cov)
 
-    noisy = still._replace(C=0.02 * np.eye(6))
-    _, X, variances = after(lambda slam: update_depth(slam, noisy, 0.01, 0.03))
-    assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
-    assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
     rpy, _, variances = after(
         lambda slam: slam.update_up(
@@ -363,38 +357,17 @@ def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(
             true._replace(landmarks=point[None]), world._replace(landmarks=where[None])
         )[-3:]
 
-    def shift(true, eps):
-        turned = (
-            filter_.error(true, world)[-3:]
-            if filter_ is Ekf
-            else Invariant.error(true, world)[-3:]
-        )
-        return turned - seen(true, eps)
-
-    H, H_m = numerical(shift, filter_, world)
+    H, H_m = numerical(
+        lambda true, eps: filter_.error(true, world)[-3:] - seen(true, eps),
+        filter_,
+        world,
+    )
     G_z = central_differences(lambda off: seen(world, NOTHING, off), np.zeros(3))
     aperture = CALIBRATION.sonar.elevation_aperture_rad
     V = np.diag([1e-6 + view[0] ** 2 * aperture**4 / 320.0, 1e-6, aperture**2 / 12.0])
     judged = slam.observe_far(motion, 1, view[:2], R_z)
     assume(judged is not None)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + G_z @ V @ G_z.T, e)
-
-
-def test_the_bias_walks_where_there_is_one():
-    slam = begun(Invariant, world_at(ANGLES))
-    motion = motion_of(np.zeros(6), np.zeros((6, 6)))
-    duration_s = 4.0
-    before = slam.state()[1].P
-    walks = (
-        [CALIBRATION.imu.gyro_bias_walk_density] * 6
-        + [CALIBRATION.imu.accel_bias_walk_density] * 3
-        + [0.0] * 2
-    )
-    predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
-    walked = np.diag(
-        [0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9
-    )
-    assert_allclose(slam.state()[1].P - before, walked, atol=1e-15)
 
 
 def gauge(axes):
@@ -426,6 +399,3 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(
     slam = begun(Invariant, world, known)
     update_depth(slam, motion, 0.3, 1e-2)
     assert np.abs(slam.state()[1].P - known).max() > 0.5
-
-
-# ---------------------------------------------------------------------------------------------- observability

@@ -38,9 +38,9 @@ def assert_found(estimate: Estimate1D, truth: float, widest: float) -> None:
     assert abs(estimate.value - truth) < 4 * estimate.sigma < widest
 
 
-def spoilt(seed: int = 1) -> Sequence:
+def spoilt() -> Sequence:
     """A mission whose Doppler log is stamped early, turned and short by known amounts."""
-    run = simulate_mission(MissionOptions(seed=seed, duration_s=240, landmarks=1))
+    run = simulate_mission(MissionOptions(seed=1, duration_s=240, landmarks=1))
     early = run.dvl.stamps_ns - round(OFFSET_S * 1e9)
     velocity = Rotation.from_euler("z", -YAW_RAD).apply(run.dvl.velocity) / SCALE
     return replace(run, dvl=Dvl(early, velocity, run.dvl.velocity_cov))
@@ -209,11 +209,11 @@ def referenced(imu: Imu, reference: Trajectory) -> ReferenceMatch:
     return match_reference_to_imu(imu, reference, RUN.calibration)
 
 
-def early(offset_s: float, seed: int = 0, wrong_rad: float = 0.0) -> Trajectory:
+def early(offset_s: float, wrong_rad: float = 0.0) -> Trajectory:
     truth = RUN.truth
     stamps = truth.stamps_ns[::50]
     noise = Rotation.from_rotvec(
-        1e-3 * np.random.default_rng(seed).standard_normal((len(stamps), 3))
+        1e-3 * np.random.default_rng(0).standard_normal((len(stamps), 3))
     )
     seconds = (stamps - stamps[0]) * 1e-9
     turned = Rotation.from_euler("z", np.where(seconds < 11, wrong_rad, 0.0)[:, None])

@@ -31,16 +31,12 @@ BLIND = np.diag([SIGMA**2, 100.0**2, 100.0**2])
 WHOLE = np.eye(3) * SIGMA**2
 
 
-def driven(
-    partial: tuple[int, ...] = (),
-    outliers: tuple[int, ...] = (),
-    blind: np.ndarray = BLIND,
-) -> Dvl:
+def driven(partial: tuple[int, ...] = (), outliers: tuple[int, ...] = ()) -> Dvl:
     """Straight ahead at 0.8 m/s; some rows measure the surge alone, some are wrong by 3 m/s."""
     at = stamps(DVL_HZ, SECONDS)
     velocity = np.tile([0.8, 0.0, 0.0], (len(at), 1))
     cov = np.tile(WHOLE, (len(at), 1, 1))
-    cov[list(partial)] = blind
+    cov[list(partial)] = BLIND
     velocity[list(outliers), 0] += 3.0
     return dvl(at, velocity, cov)
 
