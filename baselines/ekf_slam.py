@@ -54,7 +54,7 @@ from baselines.kalman import (
     write_judged,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.models import (
     Mount,
     locate_from_body,
@@ -326,19 +326,6 @@ def follow(x: Floats, P: Floats, events: Events, setup: FilterSetup, first: int)
     return k
 
 
-@compiled
-def update_numbers(
-    x: Floats, P: Floats, places: Ints, e: Floats, variances: Floats
-) -> None:
-    """Update by direct measurements of m numbers of the state, at their places."""
-    H = np.zeros((len(places), len(x)))
-    R = np.zeros((len(places), len(places)))
-    for k in range(len(places)):
-        H[k, places[k]] = 1.0
-        R[k, k] = variances[k]
-    update(x, P, H, e, R)
-
-
 class EkfSlamParams(FilterParams):
     """Settings of EKF-SLAM; the paper gives none of them."""
 
@@ -382,15 +369,16 @@ class EkfSlam(FilterShell):
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         angles = euler_from_rotation(mat(start.pose().rotation().matrix()))
-        places = self._known.places()
-        self._x = np.concatenate((np.zeros(MAP), places.ravel()))
-        self._x[:3] = start.position_m
-        self._x[ROLL:POSE] = angles
+        places = self._known.places().ravel()
+        self._x = np.concatenate((start.position_m, angles, [0.0], places))
+        sigmas = (
+            *start.position_sigma_m,
+            *start.rpy_sigma_rad,
+            calibration.heading.bias_sigma_rad,
+        )
         self._P = np.zeros((len(self._x), len(self._x)))
+        self._P[:MAP, :MAP] = np.diag(np.square(sigmas))
         self._P[MAP:, MAP:] = self._known.joint()
-        self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self._P[ROLL:POSE, ROLL:POSE] = np.diag(np.square(start.rpy_sigma_rad))
-        self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
         self._overturned: list[str] = []
 
     def state(self) -> tuple[int, Floats, Floats]:
@@ -474,9 +462,9 @@ class EkfSlam(FilterShell):
         self, places: list[int], e: Floats, variances: list[float]
     ) -> None:
         """Update by direct measurements of numbers of the state."""
-        update_numbers(
-            self._x, self._P, np.array(places), e, np.array(variances, dtype=np.float64)
-        )
+        H = np.zeros((len(places), len(self._x)))
+        H[range(len(places)), places] = 1.0
+        self.correct(H, e, np.diag(variances))
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""

@@ -365,7 +365,6 @@ class FilterShell(ABC):
             )
             if end_ns >= max(self._reached_ns, self.node_ns):
                 call = Call(
-                    since_ns=since_ns,
                     end_ns=end_ns,
                     node_ns=self.node_ns,
                     opened_ns=self._opened_ns,
@@ -484,7 +483,7 @@ class FilterShell(ABC):
             return NO_SAMPLES
         if len(blocks) == 1:
             return blocks[0]
-        samples = Samples(*map(np.concatenate, zip(*blocks, strict=True)))
+        samples = Samples._make(map(np.concatenate, zip(*blocks, strict=True)))
         return _rows(samples, np.argsort(samples.stamp_ns, kind="stable"))
 
     def _depths(self, depth: Depth) -> Samples:
@@ -844,4 +843,4 @@ def _scalars(
 
 
 def _rows(samples: Samples, rows: Ints | NDArray[np.bool_]) -> Samples:
-    return Samples(*(column[rows] for column in samples))
+    return Samples._make(column[rows] for column in samples)

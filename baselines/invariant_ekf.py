@@ -42,6 +42,7 @@ Every H but those of compass and position fixes is zero along a shift of everyth
 vertical, at any estimate, so these unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
+from copy import deepcopy
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -385,12 +386,7 @@ class InvariantEkf(FilterShell):
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
-        return self.node_ns, self._state._replace(
-            R=self._state.R.copy(),
-            points=self._state.points.copy(),
-            bias=self._state.bias.copy(),
-            P=self._state.P.copy(),
-        )
+        return self.node_ns, deepcopy(self._state)
 
     def follow(self, events: Events, first: int) -> int:
         """Predict to epochs, update by depths and frames, in turn; the number of the event that is next."""

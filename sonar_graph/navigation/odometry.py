@@ -42,7 +42,6 @@ from sonar_graph.navigation.preintegration import (
     Stretch,
     motions_over,
     rows_until,
-    value_at,
 )
 from sonar_graph.navigation.samples import (
     EARLIEST_NS,
@@ -51,7 +50,7 @@ from sonar_graph.navigation.samples import (
     finite_vector,
     no_doppler_stamp,
 )
-from sonar_graph.numerics import compiled, cross, vec
+from sonar_graph.numerics import compiled
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import RefusedRow
 
@@ -100,7 +99,7 @@ class Odometry:
         self._hold_past = calibration.odometry_interpolation == "hold-past"
         self._turns = UNTURNED if self._hold_past else turns_of(calibration.imu)
         self._sensors = Sensors.of(calibration)
-        self._dvl_p_imu = vec(self._sensors.body_p_imu - self._sensors.body_p_dvl)
+        self._dvl_p_imu = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
         self._earth = earth_rate_in_world(calibration)
         self._kept = NOTHING_KEPT
         """Start, bias and Earth's rotation of a motion, and its part since the last gap, with the motion before it."""
@@ -312,26 +311,44 @@ class Odometry:
         k = int(dvl_ns.searchsorted(epoch_ns))
         if k == len(dvl_ns) or dvl_ns[k] != epoch_ns:
             raise no_doppler_stamp("epoch_ns", epoch_ns, dvl_ns)
+        x, y, z = self._rate_at(epoch_ns)
+        a, b, c = self._dvl_p_imu
+        # w x (imu - dvl); np.cross takes ten times as long
+        swing = (
+            y * c - z * b,
+            z * a - x * c,
+            x * b - y * a,
+        )
+        xx, yy, zz = cov[k].diagonal().tolist()
+        return velocity[k] + swing, (xx + yy + zz) / 3.0
+
+    def _rate_at(self, epoch_ns: int) -> list[float]:
+        """Angular rate at an epoch, body axes, rad/s."""
+        rate = self._imu.values[0]
         imu_ns = self._imu.stamps_ns
         i = int(imu_ns.searchsorted(epoch_ns))
-        rate = self._imu.values[0]
-        w = value_at(imu_ns, rate, len(rate), i, epoch_ns, self._hold_past)
-        # np.cross takes ten times as long
-        swing = cross(w, self._dvl_p_imu)
-        return np.array(vec(velocity[k]) + swing), float(cov[k].trace()) / 3.0
+        after: list[float] = rate[min(i, len(rate) - 1)].tolist()
+        if self._hold_past or not 0 < i < len(rate):
+            return after
+        share = float((epoch_ns - imu_ns[i - 1]) / (imu_ns[i] - imu_ns[i - 1]))
+        return [
+            w_0 + share * (w - w_0)
+            for w_0, w in zip(rate[i - 1].tolist(), after, strict=True)
+        ]
 
     def rows(self) -> Rows:
         """Rows of both sensors that are still needed."""
         inertial = self._imu
         log = self._dvl
-        return Rows(
+        columns = (
             inertial.stamps_ns,
             *inertial.values,
             log.stamps_ns,
             *log.values,
-            hold_past=self._hold_past,
-            turns=self._turns,
+            self._hold_past,
+            self._turns,
         )
+        return Rows._make(columns)
 
     def _epochs_between(self, after_ns: int, until_ns: int) -> tuple[int, int]:
         """First and last row (exclusive) of the epochs after one instant that are reached at another."""

@@ -86,18 +86,9 @@ class Rows(NamedTuple):
         """Rows that are known at an instant, and always the first DVL row."""
         i = self.imu_ns.searchsorted(at_ns, side="right")
         k = max(self.known_ns.searchsorted(at_ns, side="right"), 1)
-        imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, hold_past, turns = self
-        return Rows(
-            imu_ns[:i],
-            rate[:i],
-            force[:i],
-            dvl_ns[:k],
-            velocity[:k],
-            cov[:k],
-            known_ns[:k],
-            hold_past,
-            turns,
-        )
+        inertial = [column[:i] for column in self[:3]]
+        log = [column[:k] for column in self[3:7]]
+        return Rows._make([*inertial, *log, self.hold_past, self.turns])
 
 
 class Sensors(NamedTuple):

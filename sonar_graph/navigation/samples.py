@@ -50,7 +50,7 @@ class VelocityRows(NamedTuple):
 
     def where(self, is_kept: NDArray[np.bool_]) -> VelocityRows:
         """Some of the rows."""
-        return VelocityRows(*(column[is_kept] for column in self))
+        return VelocityRows._make(column[is_kept] for column in self)
 
 
 class StampedRows:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 
 from sonar_graph.calibration import (
     Calibration,
@@ -24,7 +25,7 @@ from sonar_graph.testing import check_consistent
 
 from . import ways
 from .rows import T0_NS, at, dvl, imu, stamps
-from .ways import DVL, NOISY, QUIET, Vehicle, motion
+from .ways import DVL, FOUND_LATE_S, LOST_S, NOISY, QUIET, motion, with_long_gap
 
 
 def test_both_ends_of_a_gap_count_by_their_own_noise():
@@ -56,7 +57,7 @@ def total(found):
 
 def ways_over(known, end_s):
     """Motion over the gap: as it is, by the accelerometers alone, and by a velocity that walks."""
-    imu_rows, dvl_rows = Vehicle().rows()
+    imu_rows, dvl_rows = with_long_gap()
     alone = known.model_copy(
         update={
             "dvl": known.dvl.model_copy(
@@ -65,7 +66,7 @@ def ways_over(known, end_s):
         }
     )
     return [
-        motion(rows, dvl_rows, calibration, Vehicle.LOST_S, end_s)
+        motion(rows, dvl_rows, calibration, LOST_S, end_s)
         for rows, calibration in (
             (imu_rows, known),
             (imu_rows, alone),
@@ -74,7 +75,7 @@ def ways_over(known, end_s):
     ]
 
 
-@pytest.mark.parametrize("end_s", [9.0, 12.0, 15.0, Vehicle.FOUND_S])
+@pytest.mark.parametrize("end_s", [9.0, 12.0, 15.0, FOUND_LATE_S])
 def test_a_gap_is_surer_than_by_accelerometers_alone_or_by_a_walk_alone(end_s):
     found, by_accelerometers, walked = (
         total(one) for one in ways_over(Calibration(imu=CHEAP, dvl=DVL), end_s)
@@ -82,7 +83,7 @@ def test_a_gap_is_surer_than_by_accelerometers_alone_or_by_a_walk_alone(end_s):
     for other in (by_accelerometers, walked):
         assert (
             np.linalg.eigvalsh(other - found).min()
-            > -0.02 * np.linalg.eigvalsh(other).min()
+            > -0.05 * np.linalg.eigvalsh(other).min()
         )
 
 
@@ -113,10 +114,8 @@ def test_the_errors_of_walking_vehicles_are_as_large_as_their_covariance(
     for _ in range(150):
         # piecewise linear between rows, as interpolated
         force = q * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
-        middle = 0.5 * (force[1:] + force[:-1]) / rate_hz
-        velocity = np.array([0.5, 0.0, 0.0]) + np.vstack(
-            [np.zeros(3), np.cumsum(middle, axis=0)]
-        )
+        walked = cumulative_trapezoid(force, dx=1 / rate_hz, axis=0, initial=0.0)
+        velocity = np.array([0.5, 0.0, 0.0]) + walked
         noise = np.sqrt(rate_hz) * rng.standard_normal((2, n, 3))
         biases = rng.standard_normal((2, 3))
         rate = (
@@ -133,12 +132,7 @@ def test_the_errors_of_walking_vehicles_are_as_large_as_their_covariance(
         )
         first = round(before_s * rate_hz)
         last = round(end_s * rate_hz)
-        way = (
-            np.sum(
-                0.5 * (velocity[first + 1 : last + 1] + velocity[first:last]), axis=0
-            )
-            / rate_hz
-        )
+        way = np.trapezoid(velocity[first : last + 1], dx=1 / rate_hz, axis=0)
         error = found.i_T_j.rotation().unrotate(found.i_T_j.translation() - way)
         squares.append(error @ np.linalg.solve(total(found), error))
     check_consistent(np.array(squares), 3, confidence=0.999)
@@ -198,7 +192,7 @@ def estimate(name, until_s):
     """Of an estimator that is given all rows until an instant."""
     calibration = Calibration(imu=NOISY, dvl=DVL, start=UNSURE, use_gravity=False)
     estimator = load_estimator(name)(calibration, Odometry(calibration))
-    rows = (block.between(0, at(until_s)) for block in Vehicle().rows())
+    rows = (block.between(0, at(until_s)) for block in with_long_gap())
     return estimator.process(Measurements(at(until_s), *rows))
 
 

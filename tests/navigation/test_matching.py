@@ -113,26 +113,6 @@ def with_mounting(run: Sequence, **mounting: tuple[float, float, float]) -> Cali
     return run.calibration.model_copy(update={"imu": imu})
 
 
-@pytest.mark.slow
-def test_the_lever_arm_is_found_whatever_the_calibration_says():
-    """The simulator's: (-0.2, 0, -0.15) m. From calibrations metres apart comes one arm."""
-    run = spoilt()
-    elsewhere = replace(
-        run, calibration=with_mounting(run, translation_m=(1.4, -1.2, 1.0))
-    )
-    here = matched(run)
-    there = matched(elsewhere)
-    for one, other, truth in zip(
-        here.lever, there.lever, (-0.2, 0.0, -0.15), strict=True
-    ):
-        assert_found(one, truth, 0.4)
-        assert_found(other, truth, 0.4)
-        assert abs(one.value - other.value) < 0.25 * one.sigma
-    assert there.turn[2].value == pytest.approx(
-        here.turn[2].value, abs=0.25 * here.turn[2].sigma
-    )
-
-
 def on_a_plane(arm_m: np.ndarray) -> tuple[Imu, Dvl]:
     """By hand: at 1 m/s along a swinging heading a sin(b t), level throughout; IMU at the body's origin."""
     rng = np.random.default_rng(0)
