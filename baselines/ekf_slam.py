@@ -45,11 +45,8 @@ from baselines.events import (
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
-    Judged,
     correction,
-    distance,
     judged,
-    judged_far,
     polar_covariance,
     stands_on_floor,
     symmetric,
@@ -57,15 +54,12 @@ from baselines.kalman import (
     write_judged,
 )
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.models import (
     Mount,
-    body_point_jacobian,
-    huber_scale,
     locate_from_body,
     sight_of,
     wrap_angle,
-    yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import (
@@ -332,19 +326,6 @@ def follow(x: Floats, P: Floats, events: Events, setup: FilterSetup, first: int)
     return k
 
 
-@compiled
-def update_numbers(
-    x: Floats, P: Floats, places: Ints, e: Floats, variances: Floats
-) -> None:
-    """Update by direct measurements of m numbers of the state, at their places."""
-    H = np.zeros((len(places), len(x)))
-    R = np.zeros((len(places), len(places)))
-    for k in range(len(places)):
-        H[k, places[k]] = 1.0
-        R[k, k] = variances[k]
-    update(x, P, H, e, R)
-
-
 class EkfSlamParams(FilterParams):
     """Settings of EKF-SLAM; the paper gives none of them."""
 
@@ -389,15 +370,16 @@ class EkfSlam(FilterShell):
         super().__init__(calibration, odometry, params or EkfSlamParams())
         start = calibration.start
         angles = euler_from_rotation(mat(start.pose().rotation().matrix()))
-        places = self._known.places()
-        self._x = np.concatenate((np.zeros(MAP), places.ravel()))
-        self._x[:3] = start.position_m
-        self._x[ROLL:POSE] = angles
+        places = self._known.places().ravel()
+        self._x = np.concatenate((start.position_m, angles, [0.0], places))
+        sigmas = (
+            *start.position_sigma_m,
+            *start.rpy_sigma_rad,
+            calibration.heading.bias_sigma_rad,
+        )
         self._P = np.zeros((len(self._x), len(self._x)))
+        self._P[:MAP, :MAP] = np.diag(np.square(sigmas))
         self._P[MAP:, MAP:] = self._known.joint()
-        self._P[:3, :3] = np.diag(np.square(start.position_sigma_m))
-        self._P[ROLL:POSE, ROLL:POSE] = np.diag(np.square(start.rpy_sigma_rad))
-        self._P[COMPASS, COMPASS] = calibration.heading.bias_sigma_rad**2
         self._overturned: list[str] = []
 
     def state(self) -> tuple[int, Floats, Floats]:
@@ -411,27 +393,6 @@ class EkfSlam(FilterShell):
     def observe(self, motion: Motion, views: Views, first: int) -> int:
         """Update by range and azimuth of known landmarks, (6) and (7)."""
         return observe(self._x, self._P, motion, self.sonar, views, first)
-
-    def observe_far(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats
-    ) -> Judged | None:
-        """Update by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``; None if it is near."""
-        x = self._x
-        P = self._P
-        sonar = self.sonar
-        at = MAP + LANDMARK * slot
-        R, X, T = pose_arrays(x, motion)
-        g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
-        e = g - x[at : at + LANDMARK]
-        H = np.zeros((LANDMARK, len(x)))
-        H[:, :POSE] = -G_b @ T
-        H[:, at : at + LANDMARK] = np.eye(3)  # e is the point seen less p
-        told, R_g = judged_far(
-            e, H @ P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z
-        )
-        if told is not None and told.outcome != GATED:
-            update(x, P, H, e, R_g)
-        return told
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark ``p = g(x_v, z, elevation)`` to (4) and (5), on a floor of known height if it is near.
@@ -458,44 +419,29 @@ class EkfSlam(FilterShell):
                 [sonar.floor_variance_m2],
             )
 
-    def update_heading(
-        self, motion: Motion, yaw_rad: float, variance_rad2: float
-    ) -> float:
-        """Update by a compass, ``psi' + c``, with Huber's kernel."""
-        x = self._x
-        P = self._P
-        R, _, T = pose_arrays(x, motion)
-        yaw, by_turn = yaw_and_derivative(R)
-        H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
-        H = np.zeros((1, len(x)))
-        H[:, :POSE] = H_b @ T
-        noise = H_b @ motion.C @ H_b.T
-        e = np.array([wrap_angle(yaw_rad - yaw)])
-        # judged without the estimated c: a filter that is wrong takes its error for one of the compass
-        off = distance(
-            e, H @ P @ H.T + noise + variance_rad2 + self.compass_variance_rad2
-        )
-        H[0, COMPASS] = 1.0
-        e = wrap_angle(e - x[COMPASS])
-        scale = huber_scale(e, H @ P @ H.T + noise + variance_rad2)
-        update(x, P, H, e, noise + scale * variance_rad2)
-        return off
+    def linearised(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
+        """R', X', and T as derivative by the whole state."""
+        R, X, T = pose_arrays(self._x, motion)
+        J = np.zeros((POSE, len(self._x)))
+        J[:, :POSE] = T
+        return R, X, J
 
-    def update_position(
-        self, motion: Motion, position_m: Floats, cov_m2: Floats
-    ) -> float:
-        """Update by the position of the antenna, ``X' + R' q``, with Huber's kernel."""
-        x = self._x
-        P = self._P
-        R, X, T = pose_arrays(x, motion)
-        H_b = body_point_jacobian(R, self.antenna)  # (3, 6)
-        H = np.zeros((3, len(x)))
-        H[:, :POSE] = H_b @ T
-        e = position_m - (X + R @ self.antenna)
-        noise = H_b @ motion.C @ H_b.T
-        S = symmetric(H @ P @ H.T + noise + cov_m2)
-        update(x, P, H, e, noise + huber_scale(e, S) * cov_m2)
-        return distance(e, S)
+    def covariance(self) -> Floats:
+        """P of (5)."""
+        return self._P
+
+    def correct(self, H: Floats, e: Floats, R: Floats) -> None:
+        """Update by an innovation."""
+        update(self._x, self._P, H, e, R)
+
+    def place_of(self, slot: int) -> slice:
+        """Place of a landmark in (4)."""
+        at = MAP + LANDMARK * slot
+        return slice(at, at + LANDMARK)
+
+    def compass(self) -> tuple[int, float]:
+        """Place of c in (4), and its estimate."""
+        return COMPASS, self._x[COMPASS]
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:  # noqa: ARG002  # (4) has no bias
         """Update roll and pitch by the direction of the world's up in the body."""
@@ -517,9 +463,9 @@ class EkfSlam(FilterShell):
         self, places: list[int], e: Floats, variances: list[float]
     ) -> None:
         """Update by direct measurements of numbers of the state."""
-        update_numbers(
-            self._x, self._P, np.array(places), e, np.array(variances, dtype=np.float64)
-        )
+        H = np.zeros((len(places), len(self._x)))
+        H[range(len(places)), places] = 1.0
+        self.correct(H, e, np.diag(variances))
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""

@@ -196,8 +196,6 @@ class Order(NamedTuple):
 class Call(NamedTuple):
     """Times of a call of a filter."""
 
-    since_ns: int
-    """Samples stamped earlier are passed over."""
     end_ns: int
     node_ns: int
     """Epoch of the state before the call."""
@@ -228,9 +226,7 @@ def in_order(
     frame_ns = LONG_AGO
     kind = EPOCH
     while kind != END:
-        # pass over what is late, refused, or of the frame that was just ordered
-        while sample < len(sample_ns) and sample_ns[sample] < call.since_ns:
-            sample += 1
+        # pass over what is refused, or of the frame that was just ordered
         while view < len(views.stamp_ns) and (
             views.stamp_ns[view] == frame_ns or views.outcome[view] != ACCEPTED
         ):

@@ -37,7 +37,7 @@ from baselines.events import (
     read_detections,
     remove_rate,
 )
-from baselines.kalman import NEW, Judged
+from baselines.kalman import GATED, NEW, Judged, distance, judged_far, symmetric
 from sonar_graph.calibration import (
     Calibration,
     KnownMap,
@@ -61,9 +61,14 @@ from sonar_graph.models import (
     Contradictions,
     KnownLandmarks,
     Verdict,
+    body_point_jacobian,
+    huber_scale,
     identify,
+    locate_from_body,
     tilt_sigma,
     up_direction,
+    wrap_angle,
+    yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world
@@ -216,29 +221,28 @@ class FilterShell(ABC):
         """
 
     @abstractmethod
-    def observe_far(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats
-    ) -> Judged | None:
-        """Update as `observe` by the point seen of one landmark; None where (6) and (7) are linear enough."""
-
-    @abstractmethod
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark seen for the first time, a motion after the state."""
 
     @abstractmethod
-    def update_heading(
-        self, motion: Motion, yaw_rad: float, variance_rad2: float
-    ) -> float:
-        """Update by the yaw of the body and the compass' bias, a motion after the state.
-
-        Returns its distance from the yaw in sigmas, in which the bias of the compass counts as noise.
-        """
+    def linearised(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
+        """Pose a motion after the state, (3, 3) and (3,), and J, derivative of its [theta, rho] by the state, (6, n)."""
 
     @abstractmethod
-    def update_position(
-        self, motion: Motion, position_m: Floats, cov_m2: Floats
-    ) -> float:
-        """Update by the position of the antenna, a motion after the state; its distance in sigmas."""
+    def covariance(self) -> Floats:
+        """P, shape (n, n)."""
+
+    @abstractmethod
+    def correct(self, H: Floats, e: Floats, R: Floats) -> None:
+        """Update by an innovation."""
+
+    @abstractmethod
+    def place_of(self, slot: int) -> slice:
+        """Place of a landmark in the rows of P."""
+
+    @abstractmethod
+    def compass(self) -> tuple[int, float]:
+        """Place of the constant bias of the compass in the rows of P, and its estimate, rad."""
 
     @abstractmethod
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
@@ -260,6 +264,10 @@ class FilterShell(ABC):
     def attitude(self) -> Floats:
         """world_R_body of the state, shape (3, 3)."""
 
+    def by_point(self, G: Floats) -> Floats:
+        """Derivative of the error of a point seen by the state, from G, that of its place, both shape (3, n)."""
+        return G
+
     def check(self, epoch_ns: int) -> None:
         """Look at the state after all measurements at an epoch; nothing by default."""
         del epoch_ns
@@ -267,6 +275,65 @@ class FilterShell(ABC):
     def gyro_bias(self) -> Floats:
         """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
         return NO_BIAS
+
+    # ---------------------------------------------------------------- measurements that the paper has not
+
+    def observe_far(
+        self, motion: Motion, slot: int, z: Floats, R_z: Floats
+    ) -> Judged | None:
+        """Update by a landmark far from where it is predicted, ``0 = g(x_v, z) - p``.
+
+        None where range and azimuth, (6) and (7) of the paper, are linear enough.
+        """
+        R, X, J = self.linearised(motion)
+        P = self.covariance()
+        g, G_b, G_z = locate_from_body(R, X, self.sonar.mount, z, 0.0)
+        e = g - self.points([slot])[0][0]
+        H = -self.by_point(G_b @ J)
+        H[:, self.place_of(slot)] += np.eye(3)  # e is the point seen less p
+        noise = G_b @ motion.C @ G_b.T
+        found, R_g = judged_far(e, H @ P @ H.T, noise, G_z, self.sonar, z, R_z)
+        if found is not None and found.outcome != GATED:
+            self.correct(H, e, R_g)
+        return found
+
+    def update_heading(
+        self, motion: Motion, yaw_rad: float, variance_rad2: float
+    ) -> float:
+        """Update by a compass, ``psi' + c``, with Huber's kernel, a motion after the state.
+
+        Returns its distance from the yaw in sigmas, in which the bias c of the compass counts as noise.
+        """
+        R, _, J = self.linearised(motion)
+        P = self.covariance()
+        yaw, by_turn = yaw_and_derivative(R)
+        H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
+        H = H_b @ J
+        noise = H_b @ motion.C @ H_b.T
+        e = np.array([wrap_angle(yaw_rad - yaw)])
+        # judged without the estimated c: a filter that is wrong takes its error for one of the compass
+        off = distance(
+            e, H @ P @ H.T + noise + variance_rad2 + self.compass_variance_rad2
+        )
+        place, bias_rad = self.compass()
+        H[0, place] = 1.0
+        e = wrap_angle(e - bias_rad)
+        scale = huber_scale(e, H @ P @ H.T + noise + variance_rad2)
+        self.correct(H, e, noise + scale * variance_rad2)
+        return off
+
+    def update_position(
+        self, motion: Motion, position_m: Floats, cov_m2: Floats
+    ) -> float:
+        """Update by the position of the antenna, ``X' + R' q``, with Huber's kernel; its distance in sigmas."""
+        R, X, J = self.linearised(motion)
+        H_b = body_point_jacobian(R, self.antenna)  # (3, 6)
+        H = H_b @ J
+        e = position_m - (X + R @ self.antenna)
+        noise = H_b @ motion.C @ H_b.T
+        S = symmetric(H @ self.covariance() @ H.T + noise + cov_m2)
+        self.correct(H, e, noise + huber_scale(e, S) * cov_m2)
+        return distance(e, S)
 
     # ---------------------------------------------------------------- contract of an estimator
 
@@ -298,7 +365,6 @@ class FilterShell(ABC):
             )
             if end_ns >= max(self._reached_ns, self.node_ns):
                 call = Call(
-                    since_ns=since_ns,
                     end_ns=end_ns,
                     node_ns=self.node_ns,
                     opened_ns=self._opened_ns,
@@ -417,39 +483,28 @@ class FilterShell(ABC):
             return NO_SAMPLES
         if len(blocks) == 1:
             return blocks[0]
-        samples = Samples(
-            stamp_ns=np.concatenate([block.stamp_ns for block in blocks]),
-            kind=np.concatenate([block.kind for block in blocks]),
-            value=np.concatenate([block.value for block in blocks]),
-            noise=np.concatenate([block.noise for block in blocks]),
-        )
+        samples = Samples._make(map(np.concatenate, zip(*blocks, strict=True)))
         return _rows(samples, np.argsort(samples.stamp_ns, kind="stable"))
 
     def _depths(self, depth: Depth) -> Samples:
         """Depths, with the calibration's noise where they have none."""
-        value = np.zeros((len(depth), 3))
-        noise = np.zeros((len(depth), 3, 3))
-        value[:, 2] = depth.z_m
-        noise[:, 2, 2] = np.where(
+        variance_m2 = np.where(
             np.isnan(depth.variance_m2),
             self.calibration.depth.sigma_m**2,
             depth.variance_m2,
         )
-        return _samples(depth.stamps_ns, DEPTH, value, noise)
+        return _scalars(DEPTH, 2, depth.stamps_ns, depth.z_m, variance_m2)
 
     def _headings(self, heading: Heading) -> Samples:
         """Headings, with the calibration's noise where they have none."""
-        value = np.zeros((len(heading), 3))
-        noise = np.zeros((len(heading), 3, 3))
-        value[:, 0] = heading.yaw_rad
         sigma_rad = np.where(
             np.isnan(heading.sigma_rad),
             self.calibration.heading.sigma_rad,
             heading.sigma_rad,
         )
         with np.errstate(over="ignore"):  # of an unsound row, which is refused
-            noise[:, 0, 0] = np.square(sigma_rad)
-        return _samples(heading.stamps_ns, HEADING, value, noise)
+            variance_rad2 = np.square(sigma_rad)
+        return _scalars(HEADING, 0, heading.stamps_ns, heading.yaw_rad, variance_rad2)
 
     def _fixes(self, fixes: PositionFixes) -> Samples:
         """Position fixes, with the calibration's noise where they have none."""
@@ -457,7 +512,8 @@ class FilterShell(ABC):
         noise[np.isnan(noise).any(axis=(1, 2))] = np.diag(
             np.square(self.calibration.positions.sigma_m)
         )
-        return _samples(fixes.stamps_ns, FIX, fixes.position_m.copy(), noise)
+        kind = np.full(len(fixes), FIX)
+        return Samples(fixes.stamps_ns, kind, fixes.position_m.copy(), noise)
 
     def _in_time(
         self, samples: Samples, is_sound: NDArray[np.bool_] | None, since_ns: int
@@ -777,15 +833,17 @@ SENSORS = {DEPTH: "depth", HEADING: "heading", FIX: "positions"}
 """Names in `RefusedRow`."""
 
 
-def _samples(stamps_ns: Ints, kind: int, value: Floats, noise: Floats) -> Samples:
+def _scalars(
+    kind: int, place: int, stamps_ns: Ints, values: Floats, variances: Floats
+) -> Samples:
+    """Samples of one number each."""
     n = len(stamps_ns)
+    value = np.zeros((n, 3))
+    noise = np.zeros((n, 3, 3))
+    value[:, place] = values
+    noise[:, place, place] = variances
     return Samples(stamps_ns, np.full(n, kind), value, noise)
 
 
 def _rows(samples: Samples, rows: Ints | NDArray[np.bool_]) -> Samples:
-    return Samples(
-        samples.stamp_ns[rows],
-        samples.kind[rows],
-        samples.value[rows],
-        samples.noise[rows],
-    )
+    return Samples._make(column[rows] for column in samples)

@@ -42,6 +42,7 @@ Every H but those of compass and position fixes is zero along a shift of everyth
 vertical, at any estimate, so these unobservable directions stay unobservable. Derivation: docs/theory/invariant_ekf.md.
 """
 
+from copy import deepcopy
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -69,11 +70,8 @@ from baselines.events import (
 from baselines.filter import FilterParams, FilterShell
 from baselines.kalman import (
     GATED,
-    Judged,
     correction,
-    distance,
     judged,
-    judged_far,
     polar_covariance,
     stands_on_floor,
     symmetric,
@@ -91,13 +89,10 @@ from sonar_graph.models import (
     Mount,
     bias_jacobian,
     bias_sigmas,
-    body_point_jacobian,
     gyro_bias_of,
-    huber_scale,
     locate_from_body,
     sight_of,
     wrap_angle,
-    yaw_and_derivative,
 )
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import (
@@ -391,12 +386,7 @@ class InvariantEkf(FilterShell):
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest epoch."""
-        return self.node_ns, self._state._replace(
-            R=self._state.R.copy(),
-            points=self._state.points.copy(),
-            bias=self._state.bias.copy(),
-            P=self._state.P.copy(),
-        )
+        return self.node_ns, deepcopy(self._state)
 
     def follow(self, events: Events, first: int) -> int:
         """Predict to epochs, update by depths and frames, in turn; the number of the event that is next."""
@@ -406,94 +396,56 @@ class InvariantEkf(FilterShell):
         """Update by range and azimuth of known landmarks, (5)."""
         return observe(self._state, motion, self.sonar, views, first)
 
-    def observe_far(
-        self, motion: Motion, slot: int, z: Floats, R_z: Floats
-    ) -> Judged | None:
-        """Update by a landmark far from where it is predicted, by the point seen, (6); None if it is near.
+    def linearised(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
+        """R', X', and ``J xi = [R'^T theta; R'^T (xi_0 - [X']x theta)] + D beta``, to which eps is added."""
+        R, X, D = pose_arrays(self._state, motion)
+        J = np.zeros((6, len(self._state.P)))
+        J[:3, THETA] = R.T
+        J[3:, BODY] = R.T
+        J[3:, THETA] = -R.T @ cross_matrix(X)
+        J[:, BETA] = D
+        return R, X, J
 
-        Exp(theta) turns both points: the innovation is ``xi_k - xi_new``, without theta however far they are apart.
-        """
-        state = self._state
-        sonar = self.sonar
-        R, X, D = pose_arrays(state, motion)
-        g, G_b, G_z = locate_from_body(R, X, sonar.mount, z, 0.0)
-        e = g - state.points[1 + slot]
-        H = np.zeros((POINT, len(state.P)))
-        H[:, place_of(1 + slot)] = np.eye(3)
-        H[:, BODY] = -np.eye(3)
-        H[:, BETA] = -G_b @ D  # (4)
-        told, R_g = judged_far(
-            e, H @ state.P @ H.T, G_b @ motion.C @ G_b.T, G_z, sonar, z, R_z
-        )
-        if told is not None and told.outcome != GATED:
-            update(state, H, e, R_g)
-        return told
+    def by_point(self, G: Floats) -> Floats:
+        """Derivative of xi_new, (6), by xi: of theta nothing, since Exp(theta) turns all points, and all of xi_0."""
+        G[:, THETA] = 0.0
+        G[:, BODY] = np.eye(3)
+        return G
+
+    def covariance(self) -> Floats:
+        """P of xi."""
+        return self._state.P
+
+    def correct(self, H: Floats, e: Floats, R: Floats) -> None:
+        """Update by an innovation."""
+        update(self._state, H, e, R)
+
+    def place_of(self, slot: int) -> slice:
+        """Place of a landmark in xi."""
+        return place_of(1 + slot)
+
+    def compass(self) -> tuple[int, float]:
+        """Place of c in xi, (10), and its estimate."""
+        return BETA_COMPASS, self._state.bias[COMPASS]
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
         """Append a landmark, (6), on a floor of known height if it is near."""
         state = self._state
         sonar = self.sonar
-        R, X, D = pose_arrays(state, motion)
+        R, X, J = self.linearised(motion)
         g, G_b, G_z = locate_from_body(
             R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z)
         )
-        G = np.zeros((POINT, len(state.P)))
-        G[:, BODY] = np.eye(3)
-        G[:, BETA] = G_b @ D  # (4)
+        G = self.by_point(G_b @ J)
         GP = G @ state.P
         V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
         own = symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V)
         P = np.block([[state.P, GP.T], [GP, own]])
         self._state = state._replace(points=np.vstack((state.points, g)), P=P)
-        k = len(state.points)
-        H = self._height_jacobian(k)
+        H = self._height_jacobian(len(state.points))
         if stands_on_floor(g[2], (H @ P @ H.T)[0, 0], sonar):
-            update(
-                self._state,
-                H,
-                sonar.floor_z_m - g[2:],
-                np.array([[sonar.floor_variance_m2]]),
-            )
-
-    def update_heading(
-        self, motion: Motion, yaw_rad: float, variance_rad2: float
-    ) -> float:
-        """Update by a compass, (10), with Huber's kernel."""
-        state = self._state
-        R, _, D = pose_arrays(state, motion)
-        yaw, by_turn = yaw_and_derivative(R)
-        H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
-        H = np.zeros((1, len(state.P)))
-        H[0, THETA] = R @ by_turn
-        H[:, BETA] = H_b @ D  # (4)
-        noise = H_b @ motion.C @ H_b.T
-        e = np.array([wrap_angle(yaw_rad - yaw)])
-        off = distance(
-            e, H @ state.P @ H.T + noise + variance_rad2 + self.compass_variance_rad2
-        )
-        H[0, BETA_COMPASS] = 1.0
-        e = wrap_angle(e - state.bias[COMPASS])
-        scale = huber_scale(e, H @ state.P @ H.T + noise + variance_rad2)
-        update(state, H, e, noise + scale * variance_rad2)
-        return off
-
-    def update_position(
-        self, motion: Motion, position_m: Floats, cov_m2: Floats
-    ) -> float:
-        """Update by the position of the antenna, (7), with Huber's kernel."""
-        state = self._state
-        R, X, D = pose_arrays(state, motion)
-        a = X + R @ self.antenna
-        H_b = body_point_jacobian(R, self.antenna)
-        H = np.zeros((3, len(state.P)))
-        H[:, THETA] = -cross_matrix(a)
-        H[:, BODY] = np.eye(3)
-        H[:, BETA] = H_b @ D  # (4)
-        e = position_m - a
-        noise = H_b @ motion.C @ H_b.T
-        S = symmetric(H @ state.P @ H.T + noise + cov_m2)  # (9)
-        update(state, H, e, noise + huber_scale(e, S) * cov_m2)
-        return distance(e, S)
+            variance_m2 = np.array([[sonar.floor_variance_m2]])
+            self.correct(H, sonar.floor_z_m - g[2:], variance_m2)
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
         """Update by the direction of the world's up in the body, (8)."""
@@ -540,16 +492,9 @@ class InvariantEkf(FilterShell):
         return np.array(gyro_bias_of(self._state.bias, up))
 
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state.
-
-        The error of the state is there ``[R'^T theta; R'^T (xi_0 - [X']x theta)]``, to which ``D beta + eps`` is added.
-        """
-        R, X, D = pose_arrays(self._state, motion)
-        A = np.zeros((6, BARE))
-        A[:3, THETA] = R.T
-        A[3:, BODY] = R.T
-        A[3:, THETA] = -R.T @ cross_matrix(X)
-        A[:, BETA] = D
+        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
+        R, X, J = self.linearised(motion)
+        A = J[:, :BARE]
         return R, X, symmetric(A @ self._state.P[:BARE, :BARE] @ A.T + motion.C)
 
     def points(self, slots: list[int]) -> tuple[Floats, Floats]:

@@ -5,7 +5,7 @@ in its name or docstring. Every estimator gets the same one.
 """
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import gtsam
@@ -105,17 +105,12 @@ class SectionType(ModelMetaclass):
                 text = expectation(fault["type"], fault["msg"])
                 if fault["type"] != MISFIT:
                     text += f", not {fault['input']!r:.60}"
-                # the fields of an inner section are those of another class
                 if fault["type"] == "extra_forbidden":
-                    known = (
-                        getattr(cls, "model_fields", {})
-                        if len(fault["loc"]) == 1
-                        else {}
-                    )
-                    text = (
-                        "there is no such field"
-                        + f"; there are: {', '.join(known)}" * bool(known)
-                    )
+                    text = "there is no such field"
+                    known = getattr(cls, "model_fields", {})
+                    # the fields of an inner section are those of another class
+                    if known and len(fault["loc"]) == 1:
+                        text += f"; there are: {', '.join(known)}"
                 faults.append(
                     f"{cls.__name__}.{'.'.join(map(str, fault['loc']))}: {text}"
                 )
@@ -429,48 +424,48 @@ class KnownMap(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        for name, reason in self._faults():
+            raise misfits(type(self), {name: reason})
+        return self
+
+    def _faults(self) -> Iterator[tuple[str, str]]:
+        """Fields that do not fit, with the reason; each is looked for after those before it."""
         if not self.ids:
-            raise misfits(type(self), {"ids": "a map needs at least one landmark"})
+            yield "ids", "a map needs at least one landmark"
         # a survey with one landmark in two rows
-        twice = [i for i, count in Counter(self.ids).items() if count > 1]
-        if twice:
-            raise misfits(
-                type(self), {"ids": f"landmark {twice[0]} stands twice; keep one"}
-            )
-        both = sorted({*self.moved}.intersection(self.ids))
-        if both:
-            reason = f"landmark {both[0]} has a place too; leave its row out"
-            raise misfits(type(self), {"moved": reason})
+        for landmark_id, count in Counter(self.ids).items():
+            if count > 1:
+                yield "ids", f"landmark {landmark_id} stands twice; keep one"
+        for landmark_id in sorted({*self.moved}.intersection(self.ids)):
+            yield "moved", f"landmark {landmark_id} has a place too; leave its row out"
         if len(self.positions_m) != len(self.ids):
             reason = f"expected {len(self.ids)} places, one an identity, not {len(self.positions_m)}"
-            raise misfits(type(self), {"positions_m": reason})
+            yield "positions_m", reason
         # x, y and z of each landmark
         size = 3 * len(self.ids)
         if [len(row) for row in self.covariance_m2] != [size] * size:
             reason = f"expected {size} rows of {size} numbers, three a landmark"
-            raise misfits(type(self), {"covariance_m2": reason})
+            yield "covariance_m2", reason
         P = self.joint()
         # tolerances scale with the map
         largest = float(np.abs(P).max())
         apart = np.abs(P - P.T)
         row, column = divmod(int(apart.argmax()), size)
-        eigenvalues, vectors = np.linalg.eigh(P)
-        reason = ""
         # relative to the largest entry: rounding of a text file
         if apart[row, column] > 1e-6 * largest:
             reason = (
                 f"expected a symmetric matrix, not {P[row, column]:g} in row {row + 1}, column {column + 1} and "
                 f"{P[column, row]:g} in row {column + 1}, column {row + 1}"
             )
-        elif eigenvalues[0] < -1e-9 * largest:
+            yield "covariance_m2", reason
+        eigenvalues, vectors = np.linalg.eigh(P)
+        if eigenvalues[0] < -1e-9 * largest:
             suspect = self.ids[int(np.abs(vectors[:, 0]).argmax()) // 3]
             reason = (
                 f"landmark {suspect}: expected a covariance without negative eigenvalues, such as that of a "
                 "correlation above 1"
             )
-        if reason:
-            raise misfits(type(self), {"covariance_m2": reason})
-        return self
+            yield "covariance_m2", reason
 
     def joint(self) -> NDArray[np.float64]:
         """The joint covariance as an array, shape (3 m, 3 m), m²."""

@@ -83,74 +83,41 @@ class Estimator(Protocol):
         ...
 
 
-@runtime_checkable
-class TellsRefusedRows(Protocol):
-    """Optional part of the contract: an estimator that names the rows of IMU, Doppler log and depth not used."""
-
-    def refused_rows(self) -> list[RefusedRow]:
-        """Refused rows so far."""
-        ...
+# Optional parts of the contract: methods of these names without arguments, which an estimator may have.
 
 
 def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
-    """Rows that an estimator names as not used; empty where it does not implement `TellsRefusedRows`."""
-    return (
-        list(estimator.refused_rows())
-        if isinstance(estimator, TellsRefusedRows)
-        else []
-    )
-
-
-@runtime_checkable
-class TellsWithheld(Protocol):
-    """Optional part of the contract: an estimator that names measurements which it could not use, or contradicts."""
-
-    def withheld(self) -> list[str]:
-        """Messages, a line each: what is withheld, and what is missing; what contradicts the estimate."""
-        ...
+    """Rows of IMU, Doppler log and depth that an estimator names as not used: its ``refused_rows``; or none."""
+    return list(getattr(estimator, "refused_rows", list)())
 
 
 def withheld_of(estimator: Estimator) -> list[str]:
-    """Messages about withheld measurements; empty where an estimator does not implement `TellsWithheld`."""
-    return list(estimator.withheld()) if isinstance(estimator, TellsWithheld) else []
-
-
-@runtime_checkable
-class HasNewestLandmarks(Protocol):
-    """Optional part of the contract: an estimator whose `Estimator.landmarks` takes longer the longer a run is."""
-
-    def newest_landmarks(self) -> LandmarkMap:
-        """Landmarks as of the last update, in the time of an update."""
-        ...
+    """Messages, a line each, about measurements that an estimator could not use or contradicts: its ``withheld``."""
+    return list(getattr(estimator, "withheld", list)())
 
 
 def newest_landmarks_of(estimator: Estimator) -> LandmarkMap:
-    """Landmarks for who cannot wait, of a live run: all there are where it does not implement `HasNewestLandmarks`."""
-    return (
-        estimator.newest_landmarks()
-        if isinstance(estimator, HasNewestLandmarks)
-        else estimator.landmarks()
-    )
+    """Landmarks as of the last update, in the time of an update: its ``newest_landmarks``; or all there are.
 
-
-@runtime_checkable
-class HasKnownMap(Protocol):
-    """Optional part of the contract: an estimator whose map can be given to another run."""
-
-    def known_map(self) -> KnownMap:
-        """Landmarks with their joint covariance."""
-        ...
+    For an estimator whose `Estimator.landmarks` takes longer the longer a run is.
+    """
+    found: LandmarkMap = getattr(estimator, "newest_landmarks", estimator.landmarks)()
+    return found
 
 
 def known_map_of(estimator: Estimator) -> KnownMap:
-    """Map for another run; an `EstimatorError` where an estimator has no landmark, or does not give its map."""
-    if not isinstance(estimator, HasKnownMap):
+    """Landmarks with their joint covariance, for another run: its ``known_map``.
+
+    An `EstimatorError` where an estimator has no landmark, or does not give its map.
+    """
+    if not hasattr(estimator, "known_map"):
         raise EstimatorError(
             f"{type(estimator).__name__} has no known_map(): it cannot save a map; isam2 and both filters can"
         )
     if not len(estimator.landmarks()):
         raise EstimatorError("no landmark was seen: there is no map to save")
-    return estimator.known_map()
+    found: KnownMap = estimator.known_map()
+    return found
 
 
 MakeEstimator = Callable[[Calibration, MotionSource], Estimator]

@@ -164,14 +164,6 @@ class Block:
             *(getattr(self, column.name)[selection] for column in fields(self))
         )
 
-    @classmethod
-    def of_valid(cls, *columns: NDArray[Any]) -> Self:
-        """A block of columns that are known to keep the rules, which are not checked again."""
-        # the constructor would check all rows of a log again for every step of a replay
-        block = object.__new__(cls)
-        vars(block).update(zip(_names(cls), columns, strict=True))  # type: ignore[arg-type]  # hash of a row
-        return block
-
     def between(self, after_ns: int, until_ns: int) -> Self | None:
         """The rows with ``after_ns < stamp <= until_ns``, or None without any."""
         first, last = np.searchsorted(
@@ -188,11 +180,6 @@ class Block:
                 for column in fields(cls)
             )
         )
-
-
-@cache
-def _names(kind: type[Block]) -> list[str]:
-    return [column.name for column in fields(kind)]
 
 
 @cache

@@ -136,16 +136,12 @@ class Sequence:
     @cached_property
     def start_ns(self) -> int:
         """First instant with IMU and DVL: the start pose of the calibration holds here."""
-        return max(
-            longest_part(self.imu.stamps_ns)[0], longest_part(self.dvl.stamps_ns)[0]
-        )
+        return max(longest_part(rows.stamps_ns)[0] for rows in (self.imu, self.dvl))
 
     @cached_property
     def end_ns(self) -> int:
         """Last instant with IMU and DVL."""
-        return min(
-            longest_part(self.imu.stamps_ns)[1], longest_part(self.dvl.stamps_ns)[1]
-        )
+        return min(longest_part(rows.stamps_ns)[1] for rows in (self.imu, self.dvl))
 
     def off_the_clock(self) -> list[RefusedRow]:
         """Rows more than a day before the start or after the end, which `replay` leaves out, or that are too fast."""

@@ -82,29 +82,20 @@ def settings_of(
         options = list(_sections(field.annotation))
         tag = field.discriminator
         if isinstance(tag, str):
-            docs = {
-                option: " ".join((option.__doc__ or "").split("\n\n")[0].split())
-                for option in options
-            }
             meanings = (
-                f"{' or '.join(_tags(option, tag))}: {docs[option]}"
+                f"{' or '.join(_tags(option, tag))}: {_sentence(option.__doc__)}"
                 for option in options
             )
             found[f"{path}.{tag}"] = Setting(
                 f"{path}.{tag}", getattr(value, tag), " ".join(meanings)
             )
             for option in options:
-                others = [other for other in options if other is not option]
                 for setting in settings_of(
                     option, value if isinstance(value, option) else None, f"{path}."
                 ):
                     # other options may have a setting of this name too
                     top = setting.name[len(path) + 1 :].split(".")[0]
-                    # the options that have this setting
-                    with_it = [
-                        option,
-                        *(other for other in others if top in other.model_fields),
-                    ]
+                    with_it = [each for each in options if top in each.model_fields]
                     names = " or ".join(
                         f'"{name}"' for having in with_it for name in _tags(having, tag)
                     )
@@ -213,25 +204,24 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
             f"{_path((*at.names, at.tag))}: there is no {given!r}{choice(given, known)}"
         )
     place = field_place(model, place)
+    name = _path(place)
     if error["type"] == "missing":
-        return f"{_path(place)}: is missing"
+        return f"{name}: is missing"
     if error["type"] in ("list_type", "tuple_type") and isinstance(
         error["input"], dict
     ):
-        return f"{_path(place)}: expected a list of tables, [[{_path(place)}]] in TOML, not one table"
+        return f"{name}: expected a list of tables, [[{name}]] in TOML, not one table"
     if error["type"] == "too_long" and not isinstance(error["input"], str):
-        return f"{_path(place)}: expected {error['ctx']['max_length']} values, not {_shown(error['input'])}"
+        return f"{name}: expected {error['ctx']['max_length']} values, not {_shown(error['input'])}"
     message = expectation(error["type"], error["msg"])
     if error["type"] == "model_type":
         like = (
-            f"[{_path(place)}] in TOML"
+            f"[{name}] in TOML"
             if place
             else "such as " + ", ".join(list(model.model_fields)[:3])
         )
         message = f"expected {'a section' if place else 'sections'}, {like}"
-    return (
-        f"{_path(place)}: {message}, not {_shown(error['input'])}" if place else message
-    )
+    return f"{name}: {message}, not {_shown(error['input'])}" if place else message
 
 
 def unknown_field(place: Place, model: type[BaseModel]) -> str:

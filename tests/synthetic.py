@@ -53,14 +53,9 @@ def basin_comparison(
 def with_failure(comparison: Comparison, name: str, reason: str) -> Comparison:
     """The same comparison, had one run failed."""
     failed = RunResult(name, {"gate": 0.99}, "failed", reason)
-    return replace(
-        comparison,
-        runs=[failed if run.estimator == name else run for run in comparison.runs],
-        scores={**comparison.scores, name: {}},
-        errors={
-            key: series for key, series in comparison.errors.items() if key != name
-        },
-    )
+    others = only(comparison, *(comparison.errors.keys() - {name}))
+    scores = {**comparison.scores, name: {}}
+    return replace(with_run(comparison, failed), scores=scores, errors=others.errors)
 
 
 def only(comparison: Comparison, *names: str) -> Comparison:
@@ -106,11 +101,10 @@ def late(stamp_ns: int) -> RefusedRow:
 def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
     """A comparison, had some runs refused these rows."""
     comparison = basin_comparison(60)
-    runs = [
-        replace(run, refused=refused) if run.estimator in names else run
-        for run in comparison.runs
-    ]
-    return replace(comparison, runs=runs)
+    for run in comparison.runs:
+        if run.estimator in names:
+            comparison = with_run(comparison, replace(run, refused=refused))
+    return comparison
 
 
 def _sequence(stamps: Ints, truth: Trajectory | None, planar: bool) -> Sequence:

@@ -216,14 +216,10 @@ def run(*words: object) -> int:
 
 
 def test_tags_are_written_as_landmarks_by_the_command(
-    decoder, lane_log, tmp_path, monkeypatch, capsys
+    decoder, lane_log, tmp_path, capsys
 ):
     written = tmp_path / "tags.mcap"
     words = ("recognise", lane_log, "-o", written, "--recogniser", "actag")
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "actag", None)
-        assert run(*words) == 2
-    assert "pip install benchmarks/actag_plugin" in capsys.readouterr().err
     assert run(*words, "--rule", "jeffrey") == 2
     assert "not for the recogniser actag: use --set" in capsys.readouterr().err
     assert run(*words, "--set", "tag_size=1") == 2

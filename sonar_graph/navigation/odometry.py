@@ -18,7 +18,6 @@ docs/theory/preintegration.md, docs/theory/gaps.md.
 """
 
 from types import NoneType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -58,22 +57,7 @@ from sonar_graph.states import RefusedRow
 ZERO = np.zeros(3)
 
 
-class KnownEpochs(NamedTuple):
-    """What a motion may use."""
-
-    at_ns: int
-    """Only rows that are known at this instant."""
-    epochs_ns: Ints
-    """Epochs that are reached at it, up to the end of the motion, shape (n,)."""
-
-
-class Kept(NamedTuple):
-    """Part of a motion that is final, kept for the next call with the same start, bias and Earth's rotation."""
-
-    key: tuple[int, bytes, bytes]
-    """Start, bias and Earth's rotation."""
-    stretch: Stretch
-    """From the start, or from the end of the last gap, with the motion before it."""
+NOTHING_KEPT: tuple[object, Stretch] = (None, Stretch.begin(0, ZERO))
 
 
 class Odometry:
@@ -117,7 +101,8 @@ class Odometry:
         self._sensors = Sensors.of(calibration)
         self._dvl_p_imu = (self._sensors.body_p_imu - self._sensors.body_p_dvl).tolist()
         self._earth = earth_rate_in_world(calibration)
-        self._kept: Kept | None = None
+        self._kept = NOTHING_KEPT
+        """Start, bias and Earth's rotation of a motion, and its part since the last gap, with the motion before it."""
 
     @property
     def refused(self) -> list[RefusedRow]:
@@ -147,7 +132,7 @@ class Odometry:
         placed_imu = imu is not None and self._intake.add_imu(imu)
         placed_dvl = dvl is not None and self._intake.add_dvl(dvl)
         if placed_imu or placed_dvl:
-            self._kept = None
+            self._kept = NOTHING_KEPT
         return placed_imu or placed_dvl
 
     def used_depths(self, depth: Depth | None) -> Depth | None:
@@ -208,7 +193,7 @@ class Odometry:
         spread += q**2 * share * (1.0 - share) * duration_s * np.eye(3)
         known = known_ns[after : after + 1].copy()
         self._dvl.insert(np.array([epoch_ns]), between[None], spread[None], known)
-        self._kept = None
+        self._kept = NOTHING_KEPT
 
     def epochs(self, after_ns: int, until_ns: int) -> Ints:
         """Epochs after one instant that are reached at another, in order, shape (n,)."""
@@ -274,14 +259,14 @@ class Odometry:
         # the IMU row that covers an epoch may come after the epoch's own stamp
         epochs_ns = self.epochs(EARLIEST_NS, known_ns)
         epochs_ns = epochs_ns[: epochs_ns.searchsorted(end_ns, side="right")]
-        known = KnownEpochs(known_ns, epochs_ns)
+        known = self.rows().known(known_ns)
         lost_ns = int(epochs_ns[-1]) if len(epochs_ns) else end_ns
         if lost_ns < start_ns < end_ns and self.is_gap(lost_ns, end_ns):
             # both instants lie in one open gap
-            before = self._motion_since(lost_ns, start_ns, known, removed)
-            whole = self._motion_since(lost_ns, end_ns, known, removed)
+            before = self._motion_since(lost_ns, start_ns, known, epochs_ns, removed)
+            whole = self._motion_since(lost_ns, end_ns, known, epochs_ns, removed)
             return remaining_motion(before, whole)
-        return self._motion_since(start_ns, end_ns, known, removed)
+        return self._motion_since(start_ns, end_ns, known, epochs_ns, removed)
 
     def motions(
         self,
@@ -353,21 +338,17 @@ class Odometry:
 
     def rows(self) -> Rows:
         """Rows of both sensors that are still needed."""
-        rate, force = self._imu.values
-        velocity, cov, known_ns = self._dvl.values
-        imu_ns = self._imu.stamps_ns
-        dvl_ns = self._dvl.stamps_ns
-        return Rows(
-            imu_ns,
-            rate,
-            force,
-            dvl_ns,
-            velocity,
-            cov,
-            known_ns,
+        inertial = self._imu
+        log = self._dvl
+        columns = (
+            inertial.stamps_ns,
+            *inertial.values,
+            log.stamps_ns,
+            *log.values,
             self._hold_past,
             self._turns,
         )
+        return Rows._make(columns)
 
     def _epochs_between(self, after_ns: int, until_ns: int) -> tuple[int, int]:
         """First and last row (exclusive) of the epochs after one instant that are reached at another."""
@@ -412,61 +393,51 @@ class Odometry:
             )
 
     def _motion_since(
-        self, start_ns: int, end_ns: int, known: KnownEpochs, removed: Removed
+        self,
+        start_ns: int,
+        end_ns: int,
+        rows: Rows,
+        epochs_ns: Ints,
+        removed: Removed,
     ) -> PreintegratedMotion:
-        """Motion from an instant: final to the newest epoch, provisional from there on.
+        """Motion from an instant by known rows: final to the newest epoch, provisional from there on.
 
-        Gaps between epochs are bridged; between gaps the motion is one sum of steps.
+        Gaps between epochs are bridged; between gaps the motion is one sum of steps. ``epochs_ns``: those that are
+        reached, up to the end.
         """
-        rows = self.rows()
         sensors = self._sensors
-        known_ns, epochs_ns = known
         epochs_ns = epochs_ns[epochs_ns.searchsorted(start_ns) :]
         newest_ns = int(epochs_ns[-1]) if len(epochs_ns) else start_ns
         key = start_ns, removed.bias.tobytes(), removed.earth.tobytes()
-        kept = self._kept
-        if kept is not None and kept.key == key and kept.stretch.until_ns <= newest_ns:
-            stretch = kept.stretch
-        else:
+        # what is final is kept for the next call with the same start, bias and Earth's rotation
+        kept_key, stretch = self._kept
+        if kept_key != key or stretch.until_ns > newest_ns:
             stretch = Stretch.begin(start_ns, removed.bias)
 
         if stretch.until_ns < newest_ns:
             new_ns = epochs_ns[epochs_ns.searchsorted(stretch.until_ns) :]
             if stretch.until_ns < new_ns[0] and self._lies_in_gap(start_ns):
                 found_ns = int(new_ns[0])
-                over_gap = end_of_gap(
-                    rows.known(known_ns), sensors, removed, start_ns, found_ns
-                )
+                over_gap = end_of_gap(rows, sensors, removed, start_ns, found_ns)
                 stretch = Stretch.begin(found_ns, removed.bias, over_gap)
             is_gap = new_ns[1:] - new_ns[:-1] > sensors.longest_ns
             for k in is_gap.nonzero()[0].tolist():
                 lost_ns = int(new_ns[k])
                 found_ns = int(new_ns[k + 1])
-                (until_lost,) = stretch.continued(
-                    rows, sensors, removed, [lost_ns], known_ns
-                )
+                (until_lost,) = stretch.continued(rows, sensors, removed, [lost_ns])
                 before = until_lost.motion
-                over_gap = closed_bridge(
-                    rows.known(known_ns),
-                    sensors,
-                    removed.after(before),
-                    lost_ns,
-                    found_ns,
-                )
+                here = removed.after(before)
+                over_gap = closed_bridge(rows, sensors, here, lost_ns, found_ns)
                 stretch = Stretch.begin(found_ns, removed.bias, before.then(over_gap))
         # from the newest epoch on: provisional, and not kept
         is_open = bool(len(epochs_ns)) and self.is_gap(newest_ns, end_ns)
         ends_ns = [newest_ns] if is_open else [newest_ns, end_ns]
-        until_newest, *until_end = stretch.continued(
-            rows, sensors, removed, ends_ns, known_ns
-        )
-        self._kept = Kept(key, until_newest)
+        until_newest, *until_end = stretch.continued(rows, sensors, removed, ends_ns)
+        self._kept = (key, until_newest)
         if is_open:
             before = until_newest.motion
             here = removed.after(before)
-            since_lost = open_bridge(
-                rows.known(known_ns), sensors, here, newest_ns, end_ns
-            )
+            since_lost = open_bridge(rows, sensors, here, newest_ns, end_ns)
             return before.then(since_lost)
         return until_end[0].motion
 

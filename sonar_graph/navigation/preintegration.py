@@ -57,6 +57,7 @@ from sonar_graph.numerics import (
     skew,
     store,
     store6,
+    store_vector,
     vec,
 )
 
@@ -85,18 +86,9 @@ class Rows(NamedTuple):
         """Rows that are known at an instant, and always the first DVL row."""
         i = self.imu_ns.searchsorted(at_ns, side="right")
         k = max(self.known_ns.searchsorted(at_ns, side="right"), 1)
-        imu_ns, rate, force, dvl_ns, velocity, cov, known_ns, hold_past, turns = self
-        return Rows(
-            imu_ns[:i],
-            rate[:i],
-            force[:i],
-            dvl_ns[:k],
-            velocity[:k],
-            cov[:k],
-            known_ns[:k],
-            hold_past,
-            turns,
-        )
+        inertial = [column[:i] for column in self[:3]]
+        log = [column[:k] for column in self[3:7]]
+        return Rows._make([*inertial, *log, self.hold_past, self.turns])
 
 
 class Sensors(NamedTuple):
@@ -254,9 +246,8 @@ class Stretch(NamedTuple):
         sensors: Sensors,
         removed: Removed,
         ends_ns: list[int],
-        known_ns: int = LATEST_NS,
     ) -> list[Stretch]:
-        """The stretch until each of later instants, in order, by rows that are known at an instant.
+        """The stretch until each of later instants, in order.
 
         Velocities are linear or held however far apart the samples are: gaps are for the caller to find.
         """
@@ -264,7 +255,7 @@ class Stretch(NamedTuple):
         intervals = Intervals(
             np.array([self.until_ns, *ends_ns[:-1]]),
             np.array(ends_ns),
-            np.array([known_ns] * n),
+            np.array([LATEST_NS] * n),
             LATEST_NS,
         )
         sums = np.empty((n, SIZE, 3))
@@ -273,15 +264,7 @@ class Stretch(NamedTuple):
         here = removed.after(self.before)
         C, D = add_to(sums, rows, intervals, sensors, here, are_chained=True)
         return [
-            Stretch(
-                self.start_ns,
-                end_ns,
-                self.bias,
-                self.before,
-                sums[k : k + 1],
-                C[k],
-                D[k],
-            )
+            self._replace(until_ns=end_ns, sums=sums[k : k + 1], C=C[k], D=D[k])
             for k, end_ns in enumerate(ends_ns)
         ]
 
@@ -412,8 +395,8 @@ def add_steps(
                 p += s  # (5)
                 R = R @ turn  # (6)
         store(R, sums, (at, 0))
-        put(p, sums, at + P)
-        put(impulse, sums, at + IMPULSE)
+        store_vector(p, sums[at + P], 0)
+        store_vector(impulse, sums[at + IMPULSE], 0)
         store(tt, sums, (at + TT, 0))
         store(rt, sums, (at + RT, 0))
         store(rr, sums, (at + RR, 0))
@@ -533,11 +516,3 @@ def covariance(A: Floats, k: int) -> Mat3:
         Vec3(A[k, 1, 0], A[k, 1, 1], A[k, 1, 2]),
         Vec3(A[k, 2, 0], A[k, 2, 1], A[k, 2, 2]),
     )
-
-
-@inlined
-def put(v: Vec3, out: Floats, k: int) -> None:
-    """Write what `row_of` reads."""
-    out[k, 0] = v.x
-    out[k, 1] = v.y
-    out[k, 2] = v.z

@@ -50,9 +50,7 @@ class VelocityRows(NamedTuple):
 
     def where(self, is_kept: NDArray[np.bool_]) -> VelocityRows:
         """Some of the rows."""
-        return VelocityRows(
-            self.stamps_ns[is_kept], self.velocity[is_kept], self.cov[is_kept]
-        )
+        return VelocityRows._make(column[is_kept] for column in self)
 
 
 class StampedRows:

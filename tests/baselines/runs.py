@@ -22,9 +22,7 @@ from sonar_graph.calibration import (
 from sonar_graph.measurements import (
     NS_PER_S,
     Depth,
-    Dvl,
     Heading,
-    Imu,
     LandmarkDetections,
     Measurements,
     PositionFixes,
@@ -32,11 +30,10 @@ from sonar_graph.measurements import (
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
+from tests.navigation import rows
+from tests.navigation.rows import T0_NS
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
-
-
-T0_NS = 1_700_000_000 * NS_PER_S
 
 
 STANDARD_FORCE = np.array([0.0, 0.0, 9.80665])
@@ -76,19 +73,11 @@ def later(*seconds):
 
 
 def imu(seconds, rate=(0.0, 0.0, 0.0), force=STANDARD_FORCE, rate_hz=50):
-    t = later(*np.arange(round(seconds * rate_hz) + 1) / rate_hz)
-    return Imu(
-        t, np.broadcast_to(rate, (len(t), 3)), np.broadcast_to(force, (len(t), 3))
-    )
+    return rows.imu(rows.stamps(rate_hz, seconds), rate, force)
 
 
 def dvl(seconds, velocity=(0.0, 0.0, 0.0), rate_hz=5):
-    t = later(*np.arange(round(seconds * rate_hz) + 1) / rate_hz)
-    return Dvl(
-        t,
-        np.broadcast_to(np.asarray(velocity, float), (len(t), 3)),
-        np.full((len(t), 3, 3), np.nan),
-    )
+    return rows.dvl(rows.stamps(rate_hz, seconds), velocity)
 
 
 def depths(stamps_ns, z_m, variance_m2=math.nan):
@@ -98,19 +87,14 @@ def depths(stamps_ns, z_m, variance_m2=math.nan):
 
 
 def seen(stamps_ns, range_m=2.0, azimuth_rad=0.1, landmark=3, probability=1.0):
-    shape = np.shape(stamps_ns)
-    rows = [
-        np.broadcast_to(np.asarray(values, float), shape)
-        for values in (range_m, azimuth_rad)
-    ]
-    ids = np.full((*shape, 1), landmark)
-    probabilities = np.full((*shape, 1), probability)
+    n = len(stamps_ns)
     return LandmarkDetections(
         np.asarray(stamps_ns),
-        *rows,
-        np.full((*shape, 2, 2), np.nan),
-        ids,
-        probabilities,
+        np.full(n, range_m, float),
+        np.full(n, azimuth_rad, float),
+        np.full((n, 2, 2), np.nan),
+        np.full((n, 1), landmark),
+        np.full((n, 1), probability),
     )
 
 
@@ -163,15 +147,10 @@ def circle_calibration(**imu_noise):
     )
 
 
-def circle(gyro_error=0.0, velocity_error=0.0, seconds=CIRCLE_S):
+def circle(seconds=CIRCLE_S):
     """A level circle; the DVL off the centre of the body, the accelerometer silent."""
     velocity = np.array([SPEED, 0.0, 0.0]) + np.cross([0.0, 0.0, YAW_RATE], LEVER)
-    gyro = imu(seconds, (0.0, 0.0, YAW_RATE), NO_FORCE)
-    doppler = dvl(seconds, velocity)
-    return (
-        replace(gyro, angular_velocity=gyro.angular_velocity + gyro_error),
-        replace(doppler, velocity=doppler.velocity + velocity_error),
-    )
+    return imu(seconds, (0.0, 0.0, YAW_RATE), NO_FORCE), dvl(seconds, velocity)
 
 
 def in_a_gap(depth=None, detections=None):
@@ -184,12 +163,10 @@ def in_a_gap(depth=None, detections=None):
         start=Start(position_sigma_m=(1.0, 1.0, 1.0)),
         sonar=SonarCalibration(range_sigma_m=0.001, azimuth_sigma_rad=0.001),
     )
-    rows = doppler.rows(
+    log = doppler.rows(
         (seconds <= 2.0) | ((seconds >= 12.0) & (seconds <= 14.0)) | (seconds >= 24.0)
     )
-    return Sequence(
-        "gap", calibration, imu(25, force=NO_FORCE), rows, depth, detections
-    )
+    return Sequence("gap", calibration, imu(25, force=NO_FORCE), log, depth, detections)
 
 
 def aided(mission):

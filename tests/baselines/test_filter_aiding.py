@@ -1,6 +1,5 @@
 """Laws of headings and position fixes in the filters, in gaps and late."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from baselines.ekf_slam import EkfSlam
+from baselines.filter import backwards
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import Measurements, PositionFixes
+from sonar_graph.navigation import Odometry
 from sonar_graph.states import Refusal
 from sonar_graph.testing.numerical import central_differences
 
@@ -30,10 +31,8 @@ from .runs import (
 def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind, is_late):
     """Ten fixes at 9 s of a gap constrain the start somewhat less than an exact one; a heading is as good as elsewhere."""
     fixes_ns = later(*np.linspace(9.0, 9.9, 10))
-    unknown = np.full((10, 3, 3), math.nan)
-    fixes = PositionFixes(
-        fixes_ns, np.zeros((10, 3)), np.where(np.isnan(unknown), 1e-8 * np.eye(3), 0.0)
-    )
+    covs = np.tile(1e-8 * np.eye(3), (10, 1, 1))
+    fixes = PositionFixes(fixes_ns, np.zeros((10, 3)), covs)
     sequence = replace(in_a_gap(), positions=None if is_late else fixes)
     slam = begun(kind, sequence.calibration)
     for window in sequence.replay(later(8.0, 9.95)):
@@ -44,42 +43,17 @@ def test_aiding_in_a_gap_shares_the_error_of_the_motion(kind, is_late):
     assert 1 / (1 + 1 / walked) < height_and_tilt(slam)[1] < 0.9
 
 
-def test_a_late_fix_has_the_motion_backwards_with_its_covariance(
-    monkeypatch,
-):
-    """By differences of the inverse, for the attitude at its start, that of the fix."""
-    told = []
-    gyro, doppler = circle()
-    nothing = np.zeros(6)
-    monkeypatch.setattr(
-        EkfSlam, "update_position", lambda _, motion, *__: told.append(motion) or 0.0
-    )
-    slam = begun(EkfSlam, circle_calibration())
-    end_ns = later(10.0)
-    fix_ns = later(6.03)
-    slam.process(
-        Measurements(
-            end_ns, gyro.between(T0_NS - 1, end_ns), doppler.between(T0_NS - 1, end_ns)
-        )
-    )
-    late = PositionFixes(np.array([fix_ns]), np.zeros((1, 3)), np.eye(3)[None])
-    asked = []
-    motion = slam.odometry.motion
-    monkeypatch.setattr(
-        slam.odometry, "motion", lambda *of: asked.append(of[3]) or motion(*of)
-    )
-    slam.process(Measurements(end_ns, positions=late))
-    monkeypatch.undo()
-    forth = slam.odometry.motion(fix_ns, slam.node_ns, np.zeros(3))
-    (back,) = told
+def test_a_motion_backwards_has_the_covariance_of_the_inverse():
+    """By differences."""
+    odometry = Odometry(circle_calibration())
+    odometry.add(*circle())
+    forth = odometry.motion(later(6.03), later(9.8), np.zeros(3))
+    back = backwards(forth)
     inverse = forth.i_T_j.inverse()
-    assert_allclose(
-        asked[-1] @ forth.i_T_j.rotation().matrix(), slam.attitude(), atol=1e-9
-    )
     assert_allclose(back.dR, inverse.rotation().matrix(), atol=1e-12)
     assert_allclose(back.dp, inverse.translation(), atol=1e-12)
     moved = lambda eps: inverse.localCoordinates(forth.i_T_j.retract(eps).inverse())  # noqa: E731
-    J = central_differences(moved, nothing)
+    J = central_differences(moved, np.zeros(6))
     assert_allclose(back.C, J @ forth.covariance @ J.T, rtol=1e-6, atol=1e-12)
     assert_allclose(back.D, J @ forth.D_bias, atol=1e-6)
     assert np.abs(back.C - forth.covariance).max() > 1e-6
@@ -89,7 +63,7 @@ GYRO_BIAS = np.array([2e-3, -4e-3, 6e-3])
 
 
 def on_a_winding_way(kind, *cuts):
-    """A filter on a winding way, its rows handed in by these cuts (s), and the rows after them.
+    """A filter on a winding way, its rows handed in by these cuts (s).
 
     The gyros have a bias that the invariant filter knows; EKF-SLAM, without a place for it, has gyros without.
     """
@@ -114,18 +88,7 @@ def on_a_winding_way(kind, *cuts):
         before_ns = end_ns
         if kind is InvariantEkf:
             slam._state.bias[:6] = np.tile(GYRO_BIAS, 2)
-    return slam, (
-        gyro.between(before_ns, later(65.0)),
-        doppler.between(before_ns, later(65.0)),
-    )
-
-
-def fix_at(second, position_m, sigma_m=0.01):
-    return PositionFixes(
-        np.array([later(second)]),
-        np.reshape(position_m, (1, 3)),
-        sigma_m**2 * np.eye(3)[None],
-    )
+    return slam
 
 
 def means_and_covariance(slam):
@@ -137,36 +100,33 @@ def means_and_covariance(slam):
 
 
 @slam_filters
-@pytest.mark.parametrize("late_s", [6.03, 9.93])
-def test_a_late_fix_at_the_estimate_narrows_it_and_moves_nothing(kind, late_s):
-    """Before the newest epoch, at 9.8 s, and after it; with a gyro bias in the state, where there is one."""
-    slam, _ = on_a_winding_way(kind, 1.0, late_s, 9.95)
-    assert slam.node_ns == later(9.8)
-    assert_moved_by_a_late_fix(slam, late_s, 9.95, is_used=True)
+@pytest.mark.parametrize(
+    ("now_s", "age_s", "is_used"),
+    [
+        (9.95, 0.02, True),
+        (9.95, 3.92, True),
+        (61.5, 20.0, True),
+        (61.5, 20.5, False),
+        (61.5, 35.0, False),
+    ],
+)
+def test_a_late_fix_at_the_estimate_narrows_it_up_to_twenty_seconds(
+    kind, now_s, age_s, is_used
+):
+    """And moves nothing, before the newest epoch and after it; an older one is refused by name.
 
-
-def assert_moved_by_a_late_fix(slam, late_s, now_s, *, is_used):
-    """A fix at the filter's own estimate leaves the means, and makes the covariance less where it is used."""
+    As far back as rows are kept, at 61.5 s just dropped, however many of an older time still are.
+    """
+    late_s = now_s - age_s
+    slam = on_a_winding_way(kind, *np.arange(0.5, late_s, 0.5), late_s, now_s)
     said = slam.trajectory()
     mean, P = means_and_covariance(slam)
     (then,) = np.flatnonzero(said.stamps_ns == later(late_s))
-    slam.process(
-        Measurements(later(now_s), positions=fix_at(late_s, said.positions[then]))
+    fix = PositionFixes(
+        np.array([later(late_s)]), said.positions[[then]], 1e-4 * np.eye(3)[None]
     )
+    slam.process(Measurements(later(now_s), positions=fix))
     mean_after, P_after = means_and_covariance(slam)
     assert [row.reason for row in slam.refused_rows()] == [Refusal.LATE] * (not is_used)
     assert_allclose(mean_after, mean, atol=1e-4 if is_used else 0.0)
     assert (np.trace(P_after) < 0.9 * np.trace(P)) == is_used
-
-
-@slam_filters
-@pytest.mark.parametrize(
-    ("age_s", "is_used"), [(20.0, True), (20.5, False), (35.0, False)]
-)
-def test_a_fix_counts_up_to_twenty_seconds_late_however_long_the_run(
-    kind, age_s, is_used
-):
-    """As far back as rows are kept, however many of an older time still are; an older one is refused by name."""
-    now_s = 61.5  # rows were just dropped
-    slam, _ = on_a_winding_way(kind, *np.arange(0.5, now_s + 0.1, 0.5))
-    assert_moved_by_a_late_fix(slam, now_s - age_s, now_s, is_used=is_used)

@@ -1,5 +1,8 @@
 """Equations of both filters against numerical derivatives through numpy and gtsam, and the textbook's updates."""
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import gtsam
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines import ekf_slam, invariant_ekf
 from baselines.kalman import USED
-from sonar_graph.calibration import DepthCalibration, PlanarMotion, Start
+from sonar_graph.calibration import PlanarMotion, Start
 from sonar_graph.models import locate, range_azimuth
 from sonar_graph.navigation import Odometry
 from sonar_graph.testing.numerical import central_differences
@@ -22,7 +25,6 @@ from .filters import (
     NOTHING,
     PORT,
     STILL,
-    Ekf,
     Invariant,
     attitudes,
     begun,
@@ -134,94 +136,84 @@ def in_view(angles, motion, view):
     return world_at(angles, np.vstack([LANDMARKS[0], where]))
 
 
-@both
-@given(attitudes, twists, views)
-def test_updates_by_detection_depth_heading_and_fix_are_the_textbook_s(
-    filter_, angles, twist, view
-):
-    """With numerical derivatives; the log's noise is correlated."""
-    motion = motion_of(twist, C)
-    e = np.array([0.01, -0.005])
-    R_z = np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
-    world = in_view(angles, motion, view)
+class Kind(NamedTuple):
+    """A measurement a motion after the state: its value by world and perturbation, and the update by it."""
+
+    value: Callable[..., Any]
+    update: Callable[..., Any]
+    widths: float = np.inf
+    """Standard deviations from which on Huber's kernel widens the noise."""
+
+
+KINDS = {
+    "detection": Kind(
+        lambda true, *of: range_azimuth(sonar_after(true, *of), true.landmarks[1]),
+        lambda slam, motion, z, R: observe_one(slam, motion, 1, z, R),
+    ),
+    "depth": Kind(
+        lambda *of: pose_after(*of).transformFrom(PORT)[2:],
+        lambda slam, motion, z, R: update_depth(slam, motion, z.item(), R.item()),
+    ),
+    "heading": Kind(
+        lambda true, *of: np.array(
+            [pose_after(true, *of).rotation().yaw() + true.bias[9]]
+        ),
+        lambda slam, motion, z, R: slam.update_heading(
+            motion, z.item() - 2 * np.pi, R.item()
+        ),
+        1.345,
+    ),
+    "fix": Kind(
+        lambda *of: pose_after(*of).transformFrom(ANTENNA),
+        lambda slam, *of: slam.update_position(*of),
+        1.628,
+    ),
+}
+
+
+def updated(filter_, kind, world, motion, deviations):
+    """Update by a value so many standard deviations off, against the textbook's with numerical derivatives."""
     slam = begun(filter_, world, gate=1.0)
     _, P = filter_.estimate(slam)
+    z = kind.value(world, motion, NOTHING)
     H, H_m = numerical(
-        lambda true, eps: range_azimuth(
-            sonar_after(true, motion, eps), true.landmarks[1]
-        ),
+        lambda true, eps: kind.value(true, motion, eps),
         filter_,
         world,
-        [1],
+        [len(z) - 1] if len(z) < 3 else (),
     )
-    outcome, innovation, S = observe_one(slam, motion, 1, view[:2] + e, R_z)
-    assert outcome == USED
-    assert_allclose(innovation, e, atol=1e-9)
-    assert_covariance(S, H @ P @ H.T + H_m @ C @ H_m.T + R_z)
-    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + R_z, e)
-
-    slam = begun(filter_, world)
-    height = lambda true, eps: pose_after(true, motion, eps).transformFrom(PORT)[2:]  # noqa: E731
-    H, H_m = numerical(height, filter_, world)
-    update_depth(slam, motion, height(world, NOTHING)[0] + 0.02, 3e-4)
-    assert_corrected(
-        filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, np.array([0.02])
-    )
-
-    assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
-
-    def compass(true, eps):
-        return np.array([pose_after(true, motion, eps).rotation().yaw() + true.bias[9]])
-
-    H, H_m = numerical(compass, filter_, world, [0])
-    slam = begun(filter_, world)
-    e = np.array([-0.01])
-    slam.update_heading(motion, compass(world, NOTHING)[0] + e[0] - 2 * np.pi, 3e-4)
-    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + 3e-4, e)
-
-    antenna = lambda true, eps: pose_after(true, motion, eps).transformFrom(ANTENNA)  # noqa: E731
-    H, H_m = numerical(antenna, filter_, world)
-    slam = begun(filter_, world)
-    e = np.array([0.01, -0.02, 0.03])
-    R_z = random_covariance(3, 0.05) + 1e-3 * np.eye(3)
-    slam.update_position(motion, antenna(world, NOTHING) + e, R_z)
-    assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + R_z, e)
+    R_z = random_covariance(len(z), 0.05) + 1e-3 * np.eye(len(z))
+    noise = H_m @ motion.C @ H_m.T
+    S = H @ P @ H.T + noise + R_z
+    e = np.zeros(len(z))
+    e[-1] = deviations / np.sqrt(np.linalg.inv(S)[-1, -1])
+    told = kind.update(slam, motion, z + e, R_z)
+    R = noise + max(deviations / kind.widths, 1.0) * R_z
+    assert_corrected(filter_, slam, world, P, H, R, e)
+    return told, (USED, e, S)
 
 
 @both
-def test_an_outlying_fix_has_the_kernel_s_noise(filter_):
-    """Ten standard deviations S off, ``R`` is ``10 / 1.628 R``; 1.6 off it is R; k of a heading is 1.345."""
-    world = world_at(ANGLES)
-    R_z = np.diag([0.04, 0.09, 0.25])
-    _, P = filter_.estimate(begun(filter_, world))
-    H, _ = numerical(
-        lambda true, eps: pose_after(true, STILL, eps).transformFrom(ANTENNA),
-        filter_,
-        world,
-    )
-    for deviations, times in ((1.6, 1.0), (10.0, 10.0 / 1.628)):
-        slam = begun(filter_, world)
-        e = np.zeros(3)
-        e[0] = deviations / np.sqrt(np.linalg.inv(H @ P @ H.T + R_z)[0, 0])
-        slam.update_position(
-            STILL, pose_after(world, STILL).transformFrom(ANTENNA) + e, R_z
-        )
-        assert_corrected(filter_, slam, world, P, H, times * R_z, e)
-    H, _ = numerical(
-        lambda true, eps: np.array(
-            [pose_after(true, STILL, eps).rotation().yaw() + true.bias[9]]
-        ),
-        filter_,
-        world,
-        [0],
-    )
-    S = (H @ P @ H.T).item() + 1e-4
-    for deviations, times in ((1.3, 1.0), (5.0, 5.0 / 1.345)):
-        slam = begun(filter_, world)
-        e = np.array([deviations * np.sqrt(S)])
-        yaw = pose_after(world, STILL).rotation().yaw() + world.bias[9]
-        slam.update_heading(STILL, yaw + e[0], 1e-4)
-        assert_corrected(filter_, slam, world, P, H, times * np.array([[1e-4]]), e)
+@pytest.mark.parametrize("kind", KINDS)
+@given(attitudes, twists, views)
+def test_updates_are_the_textbook_s_with_numerical_derivatives(
+    filter_, kind, angles, twist, view
+):
+    motion = motion_of(twist, C)
+    world = in_view(angles, motion, view)
+    assume(abs(pose_after(world, motion).rotation().pitch()) < 1.4)
+    told, expected = updated(filter_, KINDS[kind], world, motion, 0.05)
+    if kind == "detection":
+        for one, other in zip(told, expected, strict=True):
+            assert_allclose(one, other, rtol=1e-6, atol=1e-8)
+
+
+@both
+@pytest.mark.parametrize("kind", ["heading", "fix"])
+@pytest.mark.parametrize("deviations", [1.3, 1.6, 5.0])
+def test_outlying_headings_and_fixes_have_the_kernel_s_noise(filter_, kind, deviations):
+    """Five standard deviations S off, ``R`` is ``5 / k R``, k 1.345 of a heading and 1.628 of a fix; below k it is R."""
+    updated(filter_, KINDS[kind], world_at(ANGLES), STILL, deviations)
 
 
 @both
@@ -254,11 +246,10 @@ def test_a_new_landmark_has_the_numerical_covariance_and_correlations(
 
 
 @both
-def test_depth_up_and_plane_are_scalar_kalman_updates(filter_):
+def test_up_and_plane_are_scalar_kalman_updates(filter_):
     """At the origin and level: ``1 / P' = 1 / P + 1 / R``, and the estimate moves by ``P / (P + R)``."""
     start = Start(rpy_sigma_rad=(0.1, 0.2, 0.3), position_sigma_m=(0.1, 0.2, 0.5))
-    depth = DepthCalibration()
-    calibration = CALIBRATION.model_copy(update={"start": start, "depth": depth})
+    calibration = CALIBRATION.model_copy(update={"start": start})
     roll, pitch, _, _, _, z = np.square((*start.rpy_sigma_rad, *start.position_sigma_m))
     still = motion_of(np.zeros(6), np.zeros((6, 6)), np.zeros((6, 3)))
 
@@ -268,10 +259,6 @@ def test_depth_up_and_plane_are_scalar_kalman_updates(filter_):
         R, X, cov = slam.pose_after(still)
         return gtsam.Rot3(R).rpy(), X, np.diag(cov)
 
-    noisy = still._replace(C=0.02 * np.eye(6))
-    _, X, variances = after(lambda slam: update_depth(slam, noisy, 0.01, 0.03))
-    assert variances[5] == pytest.approx(1 / (1 / z + 1 / 0.05))
-    assert X[2] == pytest.approx(0.01 * z / (z + 0.05))
     # the body's y axis points up by a milliradian: roll
     rpy, _, variances = after(
         lambda slam: slam.update_up(
@@ -363,38 +350,17 @@ def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(
             true._replace(landmarks=point[None]), world._replace(landmarks=where[None])
         )[-3:]
 
-    def shift(true, eps):
-        turned = (
-            filter_.error(true, world)[-3:]
-            if filter_ is Ekf
-            else Invariant.error(true, world)[-3:]
-        )
-        return turned - seen(true, eps)
-
-    H, H_m = numerical(shift, filter_, world)
+    H, H_m = numerical(
+        lambda true, eps: filter_.error(true, world)[-3:] - seen(true, eps),
+        filter_,
+        world,
+    )
     G_z = central_differences(lambda off: seen(world, NOTHING, off), np.zeros(3))
     aperture = CALIBRATION.sonar.elevation_aperture_rad
     V = np.diag([1e-6 + view[0] ** 2 * aperture**4 / 320.0, 1e-6, aperture**2 / 12.0])
     judged = slam.observe_far(motion, 1, view[:2], R_z)
     assume(judged is not None)
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + G_z @ V @ G_z.T, e)
-
-
-def test_the_bias_walks_where_there_is_one():
-    slam = begun(Invariant, world_at(ANGLES))
-    motion = motion_of(np.zeros(6), np.zeros((6, 6)))
-    duration_s = 4.0
-    before = slam.state()[1].P
-    walks = (
-        [CALIBRATION.imu.gyro_bias_walk_density] * 6
-        + [CALIBRATION.imu.accel_bias_walk_density] * 3
-        + [0.0] * 2
-    )
-    predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
-    walked = np.diag(
-        [0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9
-    )
-    assert_allclose(slam.state()[1].P - before, walked, atol=1e-15)
 
 
 def gauge(axes):
@@ -426,6 +392,3 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(
     slam = begun(Invariant, world, known)
     update_depth(slam, motion, 0.3, 1e-2)
     assert np.abs(slam.state()[1].P - known).max() > 0.5
-
-
-# ---------------------------------------------------------------------------------------------- observability

@@ -46,12 +46,6 @@ def bare(filter_, angles, scale):
     return world_at(angles, []), random_covariance(filter_.bare, scale)
 
 
-def with_landmark(filter_, angles=TILTED, view=(2.0, 0.3, 0.05), scale=0.002):
-    """An estimate with one landmark and its covariance, and what is to be seen of it."""
-    world = world_at(angles, locate(sonar_after(world_at(angles), MOTION), *view))
-    return world, random_covariance(filter_.bare + 3, scale), np.array(view[:2])
-
-
 def floored(z_m, sigma_m=1e-2):
     return CALIBRATION.model_copy(
         update={"floor": FloorPrior(z_m=z_m, sigma_m=sigma_m)}
@@ -129,8 +123,9 @@ def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
 
 @both
 def test_the_innovation_of_azimuth_wraps_around(filter_):
-    world, P, _ = with_landmark(filter_, view=(3.0, math.pi - 0.004, 0.1))
-    slam = begun(filter_, world, P)
+    sonar = sonar_after(world_at(TILTED), MOTION)
+    world = world_at(TILTED, locate(sonar, 3.0, math.pi - 0.004, 0.1))
+    slam = begun(filter_, world, random_covariance(filter_.bare + 3, 0.002))
     outcome, e, _ = observe_one(
         slam, MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE
     )
@@ -216,13 +211,6 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     assert e @ np.linalg.solve(S, e) > chi_square_quantile(0.999, 2)
 
 
-def far(cov, G_z, range_m, noise):
-    """True where a detection with this covariance of range and azimuth is compared with the point seen."""
-    return is_far(
-        np.array(cov, float), np.array(G_z, float), range_m, np.array(noise, float)
-    )
-
-
 def test_the_noise_of_a_far_view_includes_the_aperture():
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
     elevation = np.random.default_rng(3).uniform(
@@ -242,21 +230,12 @@ def test_linear_is_what_errs_by_less_than_the_noise():
     G_z = np.diag([1.0, 10.0, 10.0])
     longer_m = np.hypot(10.0, 1.0) - 10.0
     for share, is_linear in ((1.05, True), (0.95, False)):
-        assert (
-            far(
-                np.diag([0.0, 1.0, 0.0]),
-                G_z,
-                10.0,
-                np.diag([(share * longer_m) ** 2, 1.0]),
-            )
-            != is_linear
-        )
+        noise = np.diag([(share * longer_m) ** 2, 1.0])
+        assert is_far(np.diag([0.0, 1.0, 0.0]), G_z, 10.0, noise) != is_linear
     for sigma, is_linear in ((0.0101, True), (0.0099, False)):
-        assert (
-            far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, np.diag([1.0, sigma**2]))
-            != is_linear
-        )
-    assert not far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4]))
+        noise = np.diag([1.0, sigma**2])
+        assert is_far(np.diag([1.0, 1.0, 0.0]), G_z, 10.0, noise) != is_linear
+    assert not is_far(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, np.diag([1e-4, 1e-4]))
 
 
 @pytest.mark.parametrize("direction", [(2.0, 1.0), (2.0, -1.0), (1.0, 0.0)])

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -91,20 +90,3 @@ def test_a_robot_at_rest_learns_a_heading_only_in_the_plain_filter(
         assert_allclose(variances, 0.3**2, rtol=1e-6)
     else:
         assert variances[-1] < min(0.95 * 0.3**2, variances[0])
-
-
-def test_a_gyro_s_bias_is_learnt_from_landmarks():
-    """At rest with a gyro that turns: the landmark stays where it was, so the gyro is wrong."""
-    bias = 2e-3
-    t = later(*np.arange(0.2, 30.1, 0.2))
-    calibration = Calibration(
-        imu=ImuCalibration(gyro_noise_density=1e-4, gyro_bias_sigma=5e-3)
-    )
-    turning = Sequence(
-        "bias", calibration, imu(30, (0.0, 0.0, bias)), dvl(30), None, seen(t, 3.0, 0.0)
-    )
-    _, state = run(InvariantEkf, turning).state()
-    assert state.bias[5] == pytest.approx(bias, abs=2e-4)
-    assert state.P[8, 8] ** 0.5 < 0.1 * 5e-3
-    _, state = run(InvariantEkf, replace(turning, detections=None)).state()
-    assert state.bias[5] == pytest.approx(0.0, abs=1e-6)

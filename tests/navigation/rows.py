@@ -1,16 +1,17 @@
 """Rows of sensors along made-up motions, derivatives by differences, and dead reckoning step by step."""
 
-from collections.abc import Callable
-from itertools import pairwise
+from functools import partial
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation import Odometry
+from sonar_graph.testing.numerical import central_differences
 
 NS = 1_000_000_000
 T0_NS = 1_700_000_000 * NS
@@ -115,35 +116,26 @@ def steps_of(
     )
 
 
+def carried(dt: float, w: Floats, v: Floats, lever: Floats) -> gtsam.Pose3:
+    """Motion of a constant twist, by GTSAM's exponential; w and v at a lever arm."""
+    return gtsam.Pose3.Expmap(dt * np.concatenate([w, v - np.cross(w, lever)]))
+
+
 def dead_reckoned(steps: Steps, bias: Floats, lever: Floats) -> list[gtsam.Pose3]:
-    """Poses after every step: a constant twist for each, by GTSAM's exponential."""
+    """Poses after every step."""
     poses = [gtsam.Pose3()]
     for dt, w, v in zip(
         steps.duration_s, steps.rate - bias, steps.velocity, strict=True
     ):
-        poses.append(
-            poses[-1].compose(
-                gtsam.Pose3.Expmap(dt * np.concatenate([w, v - np.cross(w, lever)]))
-            )
-        )
+        poses.append(poses[-1].compose(carried(dt, w, v, lever)))
     return poses
 
 
-def derivative(
-    function: Callable[[Floats], ArrayLike], size: int, step: float = 1e-6
-) -> Floats:
-    """Central differences of a function at zero, one column an argument."""
-    columns = [
-        (np.asarray(function(step * axis)) - np.asarray(function(-step * axis)))
-        / (2 * step)
-        for axis in np.eye(size)
-    ]
-    return np.column_stack(columns)
-
-
-def nees(errors: ArrayLike, covariance: Floats) -> Floats:
-    """``e^T P^-1 e`` of errors (n, d) of one covariance."""
-    return np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors)
+def missed(dt: float, w: Floats, v: Floats, lever: Floats, error: Floats) -> Floats:
+    """Difference in a step by errors of rate and velocity."""
+    right = carried(dt, w, v, lever)
+    wrong = carried(dt, w + error[:3], v + error[3:], lever)
+    return gtsam.Pose3.Logmap(right.between(wrong))
 
 
 def dense_covariance(
@@ -152,27 +144,16 @@ def dense_covariance(
     """Covariance (6, 6) and bias derivative (6, 3) at the end, step by step with differentiated exponentials."""
     P = np.zeros((6, 6))
     D = np.zeros((6, 3))
-    poses = dead_reckoned(steps, bias, lever)
-    for k, (before, after) in enumerate(pairwise(poses)):
-        dt = steps.duration_s[k]
-        w = steps.rate[k] - bias
-        v = steps.velocity[k]
-        motion = before.between(after)
-
-        def off(error: Floats, dt=dt, w=w, v=v, motion=motion) -> Floats:
-            wrong = w + error[:3]
-            twist = np.concatenate([wrong, v + error[3:] - np.cross(wrong, lever)])
-            return gtsam.Pose3.Logmap(
-                motion.inverse().compose(gtsam.Pose3.Expmap(dt * twist))
-            )
-
-        G = derivative(off, 6)
-        Q = np.zeros((6, 6))
-        Q[:3, :3], Q[3:, 3:] = (
-            np.eye(3) * gyro_density**2 / dt,
-            steps.velocity_psd[k] / dt,
-        )
-        F = motion.inverse().AdjointMap()
+    for dt, w, v, psd in zip(
+        steps.duration_s,
+        steps.rate - bias,
+        steps.velocity,
+        steps.velocity_psd,
+        strict=True,
+    ):
+        G = central_differences(partial(missed, dt, w, v, lever), np.zeros(6))
+        Q = block_diag(np.eye(3) * gyro_density**2 / dt, psd / dt)
+        F = carried(dt, w, v, lever).inverse().AdjointMap()
         P = F @ P @ F.T + G @ Q @ G.T
         D = F @ D - G[:, :3]
     return P, D

@@ -14,7 +14,6 @@ from sonar_graph.navigation.dvl_screening.depth_gate import (
 )
 from sonar_graph.navigation.dvl_screening.dvl_gate import (
     GATE,
-    GateResult,
     gate_velocities,
     needed,
 )
@@ -34,31 +33,14 @@ def expected(seconds: float, u: list[float], v: list[float]) -> float:
     return float(np.sum(np.subtract(v, u) ** 2 / variances))
 
 
-def judged(
-    stamps_ns: list[int],
-    velocity: list[list[float]],
-    known: tuple[int, ...] = (),
-    gate: float = GATE,
-) -> GateResult:
-    """Rows with the covariances above in turn; those known before are at rest."""
-    cov = COVS[np.arange(len(stamps_ns)) % 2].copy()
-    n = len(known)
-    before = VelocityRows(
-        np.array(known, np.int64), np.zeros((n, 3)), np.tile(COVS[1], (n, 1, 1))
-    )
-    return gate_velocities(
-        VelocityRows(np.array(stamps_ns), np.array(velocity), cov), before, WALK, gate
-    )
-
-
 @pytest.mark.parametrize("seconds", [0.1, 1.0, 5.0, 30.0])
 def test_the_distance_is_that_of_the_formula(seconds):
     """A true velocity's passes the gate but once in a billion."""
     u = [0.6, -0.2, 0.3]
     v = [0.9, 0.4, -0.2]
-    assert judged([0, round(seconds * NS)], [u, v]).distance == pytest.approx(
-        [0.0, expected(seconds, u, v)]
-    )
+    rows = VelocityRows(np.array([0, round(seconds * NS)]), np.array([u, v]), COVS)
+    found = gate_velocities(rows, VelocityRows.of([]), WALK, GATE)
+    assert found.distance == pytest.approx([0.0, expected(seconds, u, v)])
     assert chi2(3).isf(1e-9) == pytest.approx(GATE, abs=0.05)
 
 
@@ -157,14 +139,12 @@ def test_wrong_rows_that_go_on_for_long_are_never_believed():
         assert used[~wrong].sum() >= np.count_nonzero(~wrong) - 2
 
 
-def after_gap(
-    gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3
-) -> tuple[Dvl, int]:
+def after_gap(gap_s: float, wrong: dict[int, list[float]]) -> tuple[Dvl, int]:
     """A log with a gap after 10 s, and its first row after that."""
     ns = stamps(HZ, 10.0 + gap_s + 5.0)
     ns = ns[(ns <= at(10.0)) | (ns > at(10.0 + gap_s))]
     first = int(np.argmax(np.diff(ns))) + 1
-    velocity = np.tile([speed, 0.0, 0.0], (len(ns), 1))
+    velocity = np.tile([0.3, 0.0, 0.0], (len(ns), 1))
     for row, value in wrong.items():
         velocity[first + row] = value
     return dvl(ns, velocity, 1e-4 * np.eye(3)), first
@@ -189,21 +169,12 @@ DEPTHS = Calibration(
 NOISE_M = np.sqrt(0.1**2 + 0.1**2 + UNSTATED_M**2)
 
 
-def depths(
-    seconds: list[float], z_m: list[float], variance_m2: float = np.nan
-) -> Depth:
-    return Depth(
-        np.array([at(s) for s in seconds]),
-        np.array(z_m),
-        np.full(len(z_m), variance_m2),
-    )
-
-
 def used(
     seconds: list[float], z_m: list[float], calibration: Calibration = DEPTHS
 ) -> list[int]:
     """Rows that are used; the others are named, and the same whether they come at once or one by one."""
-    rows = depths(seconds, z_m)
+    unknown = np.full(len(z_m), np.nan)
+    rows = Depth(np.array([at(s) for s in seconds]), np.array(z_m), unknown)
     found = []
     whole = Odometry(calibration)
     single = Odometry(calibration)

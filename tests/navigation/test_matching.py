@@ -38,9 +38,9 @@ def assert_found(estimate: Estimate1D, truth: float, widest: float) -> None:
     assert abs(estimate.value - truth) < 4 * estimate.sigma < widest
 
 
-def spoilt(seed: int = 1) -> Sequence:
+def spoilt() -> Sequence:
     """A mission whose Doppler log is stamped early, turned and short by known amounts."""
-    run = simulate_mission(MissionOptions(seed=seed, duration_s=240, landmarks=1))
+    run = simulate_mission(MissionOptions(seed=1, duration_s=240, landmarks=1))
     early = run.dvl.stamps_ns - round(OFFSET_S * 1e9)
     velocity = Rotation.from_euler("z", -YAW_RAD).apply(run.dvl.velocity) / SCALE
     return replace(run, dvl=Dvl(early, velocity, run.dvl.velocity_cov))
@@ -111,26 +111,6 @@ def with_mounting(run: Sequence, **mounting: tuple[float, float, float]) -> Cali
     moved = run.calibration.imu.mounting.model_copy(update=mounting)
     imu = run.calibration.imu.model_copy(update={"mounting": moved})
     return run.calibration.model_copy(update={"imu": imu})
-
-
-@pytest.mark.slow
-def test_the_lever_arm_is_found_whatever_the_calibration_says():
-    """The simulator's: (-0.2, 0, -0.15) m. From calibrations metres apart comes one arm."""
-    run = spoilt()
-    elsewhere = replace(
-        run, calibration=with_mounting(run, translation_m=(1.4, -1.2, 1.0))
-    )
-    here = matched(run)
-    there = matched(elsewhere)
-    for one, other, truth in zip(
-        here.lever, there.lever, (-0.2, 0.0, -0.15), strict=True
-    ):
-        assert_found(one, truth, 0.4)
-        assert_found(other, truth, 0.4)
-        assert abs(one.value - other.value) < 0.25 * one.sigma
-    assert there.turn[2].value == pytest.approx(
-        here.turn[2].value, abs=0.25 * here.turn[2].sigma
-    )
 
 
 def on_a_plane(arm_m: np.ndarray) -> tuple[Imu, Dvl]:
@@ -209,11 +189,11 @@ def referenced(imu: Imu, reference: Trajectory) -> ReferenceMatch:
     return match_reference_to_imu(imu, reference, RUN.calibration)
 
 
-def early(offset_s: float, seed: int = 0, wrong_rad: float = 0.0) -> Trajectory:
+def early(offset_s: float, wrong_rad: float = 0.0) -> Trajectory:
     truth = RUN.truth
     stamps = truth.stamps_ns[::50]
     noise = Rotation.from_rotvec(
-        1e-3 * np.random.default_rng(seed).standard_normal((len(stamps), 3))
+        1e-3 * np.random.default_rng(0).standard_normal((len(stamps), 3))
     )
     seconds = (stamps - stamps[0]) * 1e-9
     turned = Rotation.from_euler("z", np.where(seconds < 11, wrong_rad, 0.0)[:, None])

@@ -47,8 +47,8 @@ GYRO_DENSITY = 3e-3
 seeds = st.integers(0, 2**32 - 1)
 
 
-def same_pose(a: gtsam.Pose3, b: gtsam.Pose3, tolerance: float = 1e-10) -> bool:
-    return bool(np.abs(gtsam.Pose3.Logmap(a.between(b))).max() < tolerance)
+def same_pose(a: gtsam.Pose3, b: gtsam.Pose3) -> bool:
+    return bool(np.abs(gtsam.Pose3.Logmap(a.between(b))).max() < 1e-10)
 
 
 def sensors(interpolation: str = "linear", **options) -> Calibration:

@@ -145,25 +145,16 @@ NOTHING = np.empty((len(T_S) - 1, 3, 0))
 STEADY = np.tile(np.eye(3), (len(T_S) - 1, 1, 1))
 
 
-def searched(
-    signal: Signal, offset_s: float, seed=0, noise=NOISE, scale: float | None = None
-) -> OffsetFit:
-    """With a scale, the signal is longer too, by a factor that is common to all and found beside the offset."""
-    measured = (1 + (scale or 0.0)) * signal(T_S + offset_s)
-    measured = measured + noise * np.random.default_rng(seed).standard_normal(
-        measured.shape
-    )
+def searched(signal: Signal, offset_s: float) -> OffsetFit:
+    measured = signal(T_S + offset_s)
+    noise = np.random.default_rng(0).standard_normal(measured.shape)
+    measured = measured + NOISE * noise
 
     def line_up(at_s: float) -> list[SampleSeries]:
-        expected = signal(T_S + at_s)
-        longer = NOTHING if scale is None else np.diff(expected, axis=0)[:, :, None]
-        return [
-            SampleSeries(
-                np.diff(measured - expected, axis=0), longer, STEADY, np.diff(T_S)
-            )
-        ]
+        y = np.diff(measured - signal(T_S + at_s), axis=0)
+        return [SampleSeries(y, NOTHING, STEADY, np.diff(T_S))]
 
-    return search_offset(line_up, np.ones(0 if scale is None else 1))
+    return search_offset(line_up, np.ones(0))
 
 
 def swaying(t_s: np.ndarray) -> np.ndarray:
@@ -176,28 +167,19 @@ def swaying(t_s: np.ndarray) -> np.ndarray:
     )
 
 
-def textbook_covariance(
-    offset_s: float, noise: float, scale: float | None = None
-) -> np.ndarray:
-    """Of the offset, and of a scale: white noise on samples, whose own constant and slope are fitted too."""
+def textbook_sigma(offset_s: float) -> float:
+    """Of the offset: white noise on samples, whose own constant and slope are fitted too."""
     slope = (swaying(T_S + offset_s + 1e-4) - swaying(T_S + offset_s - 1e-4)) / 2e-4
-    columns = (
-        [slope] if scale is None else [(1 + scale) * slope, swaying(T_S + offset_s)]
-    )
     own = np.vander(T_S, 2)
-    left = np.array(
-        [(c - own @ np.linalg.lstsq(own, c, rcond=None)[0]).ravel() for c in columns]
-    )
-    return noise**2 * np.linalg.inv(left @ left.T)
+    left = slope - own @ np.linalg.lstsq(own, slope, rcond=None)[0]
+    return NOISE / float(np.linalg.norm(left))
 
 
 @pytest.mark.parametrize("offset_s", [-0.43, 0.2, 0.25, 1.36])
 def test_sigma_is_the_textbooks_between_grid_points_too(offset_s):
     found = searched(swaying, offset_s).offset()
     assert found.is_known
-    assert found.sigma == pytest.approx(
-        np.sqrt(textbook_covariance(offset_s, NOISE)[0, 0]), rel=0.15
-    )
+    assert found.sigma == pytest.approx(textbook_sigma(offset_s), rel=0.15)
     assert abs(found.value - offset_s) < 4 * found.sigma
 
 

@@ -1,7 +1,4 @@
-"""Two vehicles by hand, and every way to a motion: over steps and over gaps.
-
-One rolls, pitches and turns; the other surges and sways, with a gap of its Doppler log from 6 to 16 s.
-"""
+"""A vehicle by hand that rolls, pitches, turns and surges, and every way to a motion: over steps and over gaps."""
 
 from typing import NamedTuple
 
@@ -24,6 +21,7 @@ DVL_HZ = 2.0
 LOST_S = 6.0
 FOUND_S = 11.0
 OPEN_S = 10.8
+FOUND_LATE_S = 16.0
 WAITS_S = 1e-3
 BODY_P_IMU = np.array([0.2, -0.1, 0.1])
 BODY_P_DVL = np.array([-0.5, 0.3, -0.2])
@@ -59,6 +57,12 @@ def velocity_at(t):
     )
 
 
+def position_at(t):
+    return np.column_stack(
+        [t - 0.2 * np.cos(t), 0.8 * np.sin(0.5 * t), -0.125 * np.cos(0.8 * t)]
+    )
+
+
 def acceleration_at(t):
     return np.column_stack(
         [0.2 * np.cos(t), -0.2 * np.sin(0.5 * t), 0.08 * np.cos(0.8 * t)]
@@ -86,22 +90,47 @@ WAYS = {
 }
 
 
+def inertial(at_ns):
+    t = (at_ns - T0_NS) * 1e-9
+    force = attitude(t).inv().apply(acceleration_at(t) + np.array([0.0, 0.0, 9.8]))
+    return Imu(at_ns, rate_at(t), force)
+
+
+def doppler(at_ns, lever=BODY_P_DVL - BODY_P_IMU):
+    t = (at_ns - T0_NS) * 1e-9
+    velocity = attitude(t).inv().apply(velocity_at(t))
+    return dvl(at_ns, velocity + np.cross(rate_at(t), lever))
+
+
+def body_moved(start_s, end_s):
+    """True turn and displacement of the body from an instant to another, in its first frame."""
+    ends = np.array([start_s, end_s])
+    world_R_body = attitude(ends)
+    step = np.diff(position_at(ends) - world_R_body.apply(BODY_P_IMU), axis=0)
+    return world_R_body[0].inv() * world_R_body[1], world_R_body[0].inv().apply(step)[0]
+
+
 def rows(lever=BODY_P_DVL - BODY_P_IMU, dvl_hz=DVL_HZ, pings_s=None):
     """With velocities at these instants; or without them in two gaps, which end when a row confirms one before it."""
-    imu_ns = stamps(IMU_HZ, 16.5)
     dvl_ns = np.union1d(
         stamps(dvl_hz, 16.0), [at(FOUND_S - WAITS_S), at(15.0 - WAITS_S)]
     )
-    t, s = ((ns - T0_NS) * 1e-9 for ns in (imu_ns, dvl_ns))
-    force = attitude(t).inv().apply(acceleration_at(t) + np.array([0.0, 0.0, 9.8]))
-    velocity = attitude(s).inv().apply(velocity_at(s)) + np.cross(rate_at(s), lever)
+    s = (dvl_ns - T0_NS) * 1e-9
     kept = ((s <= LOST_S) | (s > FOUND_S - 2 * WAITS_S)) & (
         (s <= 12.0) | (s > 15.0 - 2 * WAITS_S)
     )
     kept = (
         kept if pings_s is None else np.isin(dvl_ns, [at(second) for second in pings_s])
     )
-    return Imu(imu_ns, rate_at(t), force), dvl(dvl_ns[kept], velocity[kept])
+    return inertial(stamps(IMU_HZ, 16.5)), doppler(dvl_ns[kept], lever)
+
+
+def with_long_gap():
+    """Rows of 20 s, with a gap of the Doppler log that a row before its end confirms."""
+    dvl_ns = stamps(5.0, 20.0)
+    t = (dvl_ns - T0_NS) * 1e-9
+    kept = (t <= LOST_S) | (t > FOUND_LATE_S - 0.3)
+    return inertial(stamps(50.0, 20.1)), doppler(dvl_ns[kept])
 
 
 def calibration(imu=None, body_p_imu=BODY_P_IMU, interpolation="linear", **dvl):
@@ -164,94 +193,23 @@ def spoilt(imu, dvl, column, delta):
     ), dvl
 
 
-GYRO = 2e-4
-ACCEL = 1e-3
-SIGMA = 0.005
-GRAVITY = np.array([0.0, 0.0, -9.8])
 QUIET = ImuCalibration(
     gyro_noise_density=0.0,
     gyro_bias_sigma=0.0,
     accel_noise_density=0.0,
     accel_bias_sigma=0.0,
-    mounting=Mounting(translation_m=(0.2, -0.1, 0.1)),
+    mounting=Mounting(translation_m=tuple(BODY_P_IMU)),
 )
 NOISY = QUIET.model_copy(
     update={
-        "gyro_noise_density": GYRO,
-        "accel_noise_density": ACCEL,
+        "gyro_noise_density": 2e-4,
+        "accel_noise_density": 1e-3,
         "accel_bias_sigma": 5e-3,
     }
 )
 DVL = DvlCalibration(
-    velocity_sigma_m_s=(SIGMA,) * 3, mounting=Mounting(translation_m=(-0.3, 0.2, -0.1))
+    velocity_sigma_m_s=(0.005,) * 3, mounting=Mounting(translation_m=tuple(BODY_P_DVL))
 )
-
-
-class Vehicle:
-    """Surging and swaying while it turns, by hand: x(t), v(t), a(t) and a constant rate about a tilted axis."""
-
-    IMU_HZ = 50.0
-    DVL_HZ = 5.0
-    LOST_S = 6.0
-    FOUND_S = 16.0
-    axis = np.array([0.05, -0.04, 0.12])
-
-    def attitude(self, t):
-        return Rotation.from_rotvec(np.outer(t, self.axis))
-
-    def position(self, t):
-        return np.column_stack(
-            [
-                0.3 * t + 0.5 * np.sin(0.4 * t),
-                0.8 * np.cos(0.3 * t),
-                0.2 * np.sin(0.5 * t),
-            ]
-        )
-
-    def velocity(self, t):
-        return np.column_stack(
-            [
-                0.3 + 0.2 * np.cos(0.4 * t),
-                -0.24 * np.sin(0.3 * t),
-                0.1 * np.cos(0.5 * t),
-            ]
-        )
-
-    def acceleration(self, t):
-        return np.column_stack(
-            [-0.08 * np.sin(0.4 * t), -0.072 * np.cos(0.3 * t), -0.05 * np.sin(0.5 * t)]
-        )
-
-    def imu(self, at_ns):
-        t = (at_ns - T0_NS) * 1e-9
-        lever = np.array(QUIET.mounting.translation_m)
-        body_R_world = self.attitude(t).inv()
-        force = body_R_world.apply(self.acceleration(t) - GRAVITY)
-        force += np.cross(self.axis, np.cross(self.axis, lever))
-        return Imu(at_ns, np.tile(self.axis, (len(t), 1)), force)
-
-    def dvl(self, at_ns):
-        t = (at_ns - T0_NS) * 1e-9
-        velocity = self.attitude(t).inv().apply(self.velocity(t)) + np.cross(
-            self.axis, DVL.mounting.translation_m
-        )
-        return Dvl(at_ns, velocity, np.full((len(t), 3, 3), np.nan))
-
-    def displacement(self, start_s, end_s):
-        ends = np.array([start_s, end_s])
-        return (
-            self.attitude(np.array([start_s]))
-            .inv()
-            .apply(np.diff(self.position(ends), axis=0))[0]
-        )
-
-    def rows(self):
-        """Of 20 s but the Doppler log's gap; a row before its end, to confirm that."""
-        dvl_ns = stamps(self.DVL_HZ, 20.0)
-        t = (dvl_ns - T0_NS) * 1e-9
-        return self.imu(stamps(self.IMU_HZ, 20.1)), self.dvl(
-            dvl_ns[(t <= self.LOST_S) | (t > self.FOUND_S - 0.3)]
-        )
 
 
 def motion(imu, dvl, known, start_s, until_s, bias=(0.0, 0.0, 0.0), earth=None):

@@ -72,10 +72,8 @@ def density(samples: Floats, rate_hz: float) -> Estimate1D:
     where the density at `SHORT_TAU_S` is clearly smaller: a vehicle that floats moves slowly, and noise is white.
     """
     if not np.ptp(samples, axis=0).any():
-        return Estimate1D(
-            np.nan,
-            np.inf,
-            "the same to the last bit while still: commanded, or too coarse for its noise",
+        return Estimate1D.unknown(
+            "the same to the last bit while still: commanded, or too coarse for its noise"
         )
     found = dict[float, Estimate1D]()
     for tau_s in (TAU_S, SHORT_TAU_S):
@@ -97,15 +95,13 @@ def noise_densities(imu: Imu) -> NoiseDensities:
     seconds = (imu.stamps_ns[rest] - imu.stamps_ns[0]) * 1e-9
     still_s = float(seconds[-1] - seconds[0]) if len(seconds) > 1 else 0.0
     if still_s < LEAST_STILL_S:
-        moving = Estimate1D(np.nan, np.inf, f"never still for {LEAST_STILL_S:g} s")
+        moving = Estimate1D.unknown(f"never still for {LEAST_STILL_S:g} s")
         return NoiseDensities(still_s, moving, moving)
     rate_hz = (len(seconds) - 1) / still_s
     force = imu.specific_force[rest]
     gyro = density(imu.angular_velocity[rest], rate_hz)
     if not np.isfinite(force).all():
-        return NoiseDensities(
-            still_s, gyro, Estimate1D(np.nan, np.inf, "no accelerometers")
-        )
+        return NoiseDensities(still_s, gyro, Estimate1D.unknown("no accelerometers"))
     return NoiseDensities(still_s, gyro, density(force, rate_hz))
 
 

@@ -206,7 +206,7 @@ class DvlMatch:
     @classmethod
     def unknown(cls, reason: str) -> DvlMatch:
         """Nothing is known, for one reason."""
-        nothing = Estimate1D(np.nan, np.inf, reason)
+        nothing = Estimate1D.unknown(reason)
         along_axes = (nothing,) * 3
         return cls(nothing, along_axes, nothing, along_axes, along_axes, along_axes)
 

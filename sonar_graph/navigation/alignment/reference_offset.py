@@ -75,10 +75,8 @@ def match_reference_to_imu(
         interval_s = max(float(np.median(np.diff(seconds[rows]))), 1e-9)
         rows = rows[:: max(1, int(np.ceil(LEAST_INTERVAL_S / interval_s - 1e-6)))]
     if sum(map(len, _stretches_of(path.parts_at(seconds[rows])))) < LEAST_ROWS - 1:
-        short = Estimate1D(
-            np.nan,
-            np.inf,
-            f"less than {LEAST_ROWS} poses, {LEAST_INTERVAL_S:g} s apart, while the IMU runs without a hole",
+        short = Estimate1D.unknown(
+            f"less than {LEAST_ROWS} poses, {LEAST_INTERVAL_S:g} s apart, while the IMU runs without a hole"
         )
         return ReferenceMatch(short, short)
     seconds = seconds[rows]
@@ -105,7 +103,7 @@ def match_reference_to_imu(
     offset = found.offset().limited(OFFSET_LIMIT_S, "too little turning")
     if not offset.is_known:
         return ReferenceMatch(
-            offset, Estimate1D(np.nan, np.inf, "the time offset is not known")
+            offset, Estimate1D.unknown("the time offset is not known")
         )
     return ReferenceMatch(
         offset, start_heading(path, reference, body_R_imu, offset.value)
@@ -140,9 +138,7 @@ def start_heading(
     run_s = float(np.ptp(seconds[inside]))
     inside &= path.parts_at(seconds) == path.parts_at(seconds[inside][:1])
     if np.ptp(seconds[inside]) < LEAST_PART_SHARE * run_s:
-        return Estimate1D(
-            np.nan, np.inf, "a hole of the IMU comes too soon after the start"
-        )
+        return Estimate1D.unknown("a hole of the IMU comes too soon after the start")
     C = Rotation.from_matrix(path.rotations_at(seconds[inside]))
     world_R_imu = reference.rotations()[np.flatnonzero(inside)] * Rotation.from_matrix(
         body_R_imu

@@ -289,6 +289,11 @@ class Estimate1D:
     reason: str = ""
     """Why the number is not known; empty: it is."""
 
+    @classmethod
+    def unknown(cls, reason: str) -> Estimate1D:
+        """No number, for a reason."""
+        return cls(np.nan, np.inf, reason)
+
     @property
     def is_known(self) -> bool:
         """True where the number is known."""

@@ -33,7 +33,17 @@ from sonar_graph.navigation.samples import (
     VelocityRow,
     VelocityRows,
 )
-from sonar_graph.numerics import O3, ZERO, Mat3, Vec3, compiled, inlined, row_of
+from sonar_graph.numerics import (
+    O3,
+    ZERO,
+    Mat3,
+    Vec3,
+    compiled,
+    inlined,
+    mat,
+    row_of,
+    vec,
+)
 from sonar_graph.sequence import PAUSE_NS
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -111,7 +121,7 @@ def squared_distance(
 ) -> float:
     """``e^T S^-1 e``, ``e = v - u``, of two velocities t seconds apart; S^-1 is the adjugate over the determinant."""
     x, y, z = v - u
-    may_change = walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u @ u)
+    may_change = change_variance(u, t, walk)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = Q_u + Q_v
     xx += may_change
     yy += may_change
@@ -127,6 +137,12 @@ def squared_distance(
     squares = a * x * x + d * y * y + f * z * z
     products = b * x * y + c * x * z + e * y * z
     return (squares + 2.0 * products) / determinant
+
+
+@inlined
+def change_variance(u: Vec3, t: float, walk: float) -> float:
+    """Variance of one component of what a velocity may change in a time, ``q^2 t + (w t |u|)^2``."""
+    return walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * (u @ u)
 
 
 LONG_NS = 3_000_000_000
@@ -279,12 +295,9 @@ class VelocityConfirmation:
     def _instead(self, wrong: VelocityRow, first: VelocityRow) -> VelocityRow:
         """The velocity of a later row at the stamp of a wrong one, with the variance of what may have changed."""
         t = (first.stamp_ns - wrong.stamp_ns) * 1e-9
-        turned = min(TURNING_RAD_S * t, 2.0) ** 2 * float(
-            first.velocity @ first.velocity
-        )
-        may_change = self._walk**2 * t + turned
+        changed = change_variance(vec(first.velocity), t, self._walk)
         return VelocityRow(
-            wrong.stamp_ns, first.velocity, first.cov + may_change * np.eye(3)
+            wrong.stamp_ns, first.velocity, first.cov + changed * np.eye(3)
         )
 
     def _distance(self, one: VelocityRow, other: VelocityRow) -> float:
@@ -293,10 +306,11 @@ class VelocityConfirmation:
         fast, slow = sorted(
             (one, other), key=lambda row: -float(row.velocity @ row.velocity)
         )
-        since_ns = abs(other.stamp_ns - one.stamp_ns)
-        known = VelocityRows.of([slow._replace(stamp_ns=0)])
-        rows = VelocityRows.of([fast._replace(stamp_ns=since_ns)])
-        return float(gate_velocities(rows, known, self._walk, GATE).distance[0])
+        t = abs(other.stamp_ns - one.stamp_ns) * 1e-9
+        u = vec(slow.velocity)
+        v = vec(fast.velocity)
+        distance = squared_distance(u, mat(slow.cov), v, mat(fast.cov), t, self._walk)
+        return float(distance)
 
 
 def needed(velocity: Floats) -> int:
