@@ -151,7 +151,10 @@ class Isam2:
         self._poses = PoseHistory()
         range_sigma_m = calibration.sonar.range_sigma_m
         self._smoother = Smoother(
-            self._params.smoother, self._params.history, self._poses, range_sigma_m
+            self._params.smoother,
+            self._params.history,
+            self._poses.leave,
+            range_sigma_m,
         )
         self._keyframes = Keyframes(
             calibration, odometry, self._params.keyframes, self._smoother
@@ -380,11 +383,9 @@ class Isam2:
                 raise EstimatorError(f"isam2: there is no keyframe {number}; {known}")
 
     def _require_landmarks(self, ids: list[int], over: Over) -> None:
-        known = (
-            self._smoother.landmark_ids
-            if over == "window"
-            else self._frontend.smoothed().ids
-        )
+        known = self._frontend.landmarks.ids
+        if over == "history":
+            known = self._frontend.smoothed().ids
         unknown = [landmark_id for landmark_id in ids if landmark_id not in set(known)]
         if unknown:
             listed = ", ".join(map(str, known[:MOST_LISTED])) + (
@@ -434,18 +435,19 @@ class Isam2:
         """
         smoother = self._smoother
         # a landmark that came with the last frame may wait for the next update
-        ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
-        return self._frontend.landmarks.known.with_given(
+        landmarks = self._frontend.landmarks
+        ids = [i for i in landmarks.ids if smoother.in_window([L(i)])]
+        return landmarks.known.with_given(
             map_of(smoother.estimates, smoother.marginals, ids)
         )
 
     def known_map(self) -> KnownMap:
         """Landmarks after solving the whole graph, with their joint covariance, for another run."""
-        ids = self._smoother.landmark_ids
         found = self.landmarks()
-        rows = np.searchsorted(found.ids, ids)
-        joint = self.joint_covariance(landmarks=ids, over="history")
-        return KnownMap.of(ids, found.positions[rows], covariance_m2=joint.matrix)
+        joint = self.joint_covariance(landmarks=found.ids, over="history")
+        return KnownMap.of(
+            found.ids.tolist(), found.positions, covariance_m2=joint.matrix
+        )
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""

@@ -239,11 +239,6 @@ class Keyframes:
         return self.stamps_ns[-1] if self.stamps_ns else None
 
     @property
-    def newest_s(self) -> float:
-        """Stamp of the newest keyframe in seconds, as the smoother counts them."""
-        return self.stamps_ns[-1] * S_PER_NS
-
-    @property
     def newest_key(self) -> int:
         """Key of the newest keyframe."""
         return self._newest_key
@@ -346,7 +341,7 @@ class Keyframes:
         return changes
 
     def _updated(self) -> Changed:
-        changed = self.smoother.update(self.newest_s)
+        changed = self.smoother.update()
         self._linearise()  # at the estimate that contains the new keyframe
         return changed
 
@@ -451,7 +446,7 @@ class Keyframes:
 
     def update_if_due(self) -> Changed | None:
         """Update the smoother when what was added since its last update would change the estimate."""
-        return self.smoother.update(self.newest_s) if self.smoother.is_due else None
+        return self.smoother.update() if self.smoother.is_due else None
 
     def bias(self, index: int) -> Floats:
         """Newest estimate of the biases that hold from a keyframe on, shape (11,)."""

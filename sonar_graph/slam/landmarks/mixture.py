@@ -329,12 +329,13 @@ def supporters_elsewhere(
     mixture: Mixture,
 ) -> list[TrackedObject] | None:
     """Tracked objects that agree on a better place for the landmark that they name; None: no better place."""
-    voters = objects[-MOST_VOTERS:]
-    others = [
-        each
+    naming = [
+        (each, choice)
         for each, choice in zip(objects, choices, strict=True)
-        if choice != landmark_id
+        if each.posterior.favourite == landmark_id
     ]
+    voters = [each for each, _ in naming[-MOST_VOTERS:]]
+    others = [each for each, choice in naming if choice != landmark_id]
     proposals = [
         each.sightings[0].line.point(values) for each in others[-MOST_PROPOSALS:]
     ]

@@ -23,9 +23,8 @@ from sonar_graph.calibration import tagged
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
 from sonar_graph.models import Kernel, locate
 from sonar_graph.slam.landmarks.landmark_graph import (
-    UNCHANGED,
     Assignment,
-    Decision,
+    Decisions,
     IdentityPolicy,
     LandmarkGraph,
     Solution,
@@ -116,10 +115,6 @@ class MixtureIdentities(IdentityPolicy):
         """Landmarks that an object names and is not taken for."""
         self._oldest_ns = 0
         """Stamp from which on sightings wait."""
-        self._round = 0
-        """Number of revisions of the window since the last frame, one of them to settle the estimate."""
-        self._open: list[TrackedObject] = []
-        """Objects whose choices `reconsider` revises."""
         self._chosen: tuple[gtsam.Values, int, ChosenHistory] | None = None
         """Solution from which the history was chosen, number of sightings then, and the history."""
 
@@ -141,20 +136,17 @@ class MixtureIdentities(IdentityPolicy):
                 :, :MOST_RIVALS
             ]
             kept: set[int | None] = {ids[k] for k in np.unique(nearest).tolist()}
-            kept.update(
-                *(
-                    IdentityPosterior.of(frame.detections, row).probability
-                    for row in range(len(frame))
-                )
-            )
+            for row in range(len(frame)):
+                kept.update(IdentityPosterior.of(frame.detections, row).probability)
             kept.update(map(self.landmark_of, self._tracks.values()))
             ids = [i for i in ids if i in kept]
         return [L(i) for i in ids]
 
-    def judge(self, seen: SeenFrame) -> Decision:
+    def judge(self, seen: SeenFrame) -> Decisions:
         """Choose a landmark for each detection, and for what waited in its track.
 
-        The detection of a known track is of its landmark. Tracks that are over are forgotten.
+        The detection of a known track is of its landmark. Tracks that are over are forgotten. Then revise the choices of
+        the window until none changes, and move landmarks to where their sightings agree.
         """
         frame = seen.frame
         rows = list(range(len(frame)))
@@ -174,14 +166,11 @@ class MixtureIdentities(IdentityPolicy):
                 scores.append({landmark_id: np.inf})
             else:
                 S = S_0 + frame.noise[row]
-                scores.append(
-                    self.mixture.at_first(
-                        posteriors[row], ids, frame.z[row], expected, S
-                    )
-                )
+                belief, z = posteriors[row], frame.z[row]
+                scores.append(self.mixture.at_first(belief, ids, z, expected, S))
         chosen = each_once(scores, [{frame.stamp_ns}] * len(frame))
         judged: list[Assignment] = []
-        for row, sighting in enumerate(seen.sightings(rows, seen.beam_points(rows))):
+        for row, sighting in enumerate(seen.sightings(rows)):
             each = self._tracked(tracks[row], posteriors[row])
             judged += self._extended(each, sighting, chosen[row])
         # the recogniser may use the number of a track that is over for another object
@@ -191,8 +180,10 @@ class MixtureIdentities(IdentityPolicy):
             for k, each in self._tracks.items()
             if each.sightings[-1].stamp_ns >= self._oldest_ns
         }
-        self._round = 0
-        return Decision.of(judged)
+        yield judged
+        yield from self._revised_window()
+        # places last: a landmark moves only when no choice changes any more
+        yield from self._relocated_in_window()
 
     def held(self) -> dict[int, float]:
         """Keyframes of sightings of tracks that are of no landmark yet."""
@@ -204,12 +195,6 @@ class MixtureIdentities(IdentityPolicy):
             for sighting in each.sightings
             if sighting.stamp_ns >= self._oldest_ns
         }
-
-    def reconsider(self) -> Decision:
-        """Revise the choices of the window until none changes; then move landmarks to where their sightings agree."""
-        # places last: a landmark moves only when no choice changes any more
-        revised = self._revise_window()
-        return self._relocate() if revised.is_empty else revised
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph with the choices that suit it best."""
@@ -295,54 +280,49 @@ class MixtureIdentities(IdentityPolicy):
             if new != self.landmark_of(each)
         ]
 
-    def _revise_window(self) -> Decision:
-        """Next choices in the window; empty when none changes, and after `MOST_WINDOW_ROUNDS`."""
-        self._round += 1
-        if (
-            self._round == 1
-        ):  # the window is read once a frame; later rounds revise the same objects
-            self._open = self._revisable()
-        if self._round > 1 + MOST_WINDOW_ROUNDS:
-            self._open = []
-        changes = self._changes(self._open)
-        if changes and self._round == 1:
-            # a step of a robust kernel may end far from the minimum at which the choices are to be revised
-            return Decision(settles=True)
-        preferred = [
-            (each, new) for each, new in changes if self._is_preferred(new, each)
-        ]
-        if not preferred:
-            self._open = []
-        self._dispute(preferred)
-        return Decision.of(_assigned(preferred))
+    def _revised_window(self) -> Decisions:
+        """Choices in the window, until none changes, or `MOST_WINDOW_ROUNDS` times."""
+        objects = self._revisable()
+        if not self._changes(objects):
+            return
+        # a step of a robust kernel may end far from the minimum at which the choices are to be revised
+        self.landmarks.settle()
+        for _ in range(MOST_WINDOW_ROUNDS):
+            preferred = [
+                (each, new)
+                for each, new in self._changes(objects)
+                if self._is_preferred(new, each)
+            ]
+            if not preferred:
+                return
+            self._dispute(preferred)
+            yield _assigned(preferred)
 
-    def _relocate(self) -> Decision:
-        """Begin the next disputed landmark again where the objects that name it agree that it is."""
+    def _relocated_in_window(self) -> Decisions:
+        """Begin disputed landmarks again where the objects that name them agree that they are."""
         while self._disputed:
             # the order must not depend on how the set was filled
             landmark_id = min(self._disputed)
             self._disputed.discard(landmark_id)
             if landmark_id not in self.landmarks:
                 continue
-            naming = [
-                each for each in self.objects if each.posterior.favourite == landmark_id
-            ]
-            choices = [self.landmark_of(each) for each in naming]
+            choices = [self.landmark_of(each) for each in self.objects]
             supporters = supporters_elsewhere(
-                landmark_id, naming, choices, self.smoother.estimates, self.mixture
+                landmark_id,
+                self.objects,
+                choices,
+                self.smoother.estimates,
+                self.mixture,
             )
             if supporters is not None:
-                leaving = _assigned(
-                    [
-                        (each, None)
-                        for each in self.objects
-                        if self.landmark_of(each) == landmark_id
-                    ]
-                )
-                coming = _assigned([(each, landmark_id) for each in supporters])
-                # in two rounds: a landmark begins in a new place only after it has lost its last sighting
-                return Decision((tuple(leaving), tuple(coming)))
-        return UNCHANGED
+                # a landmark begins in a new place only after it has lost its last sighting
+                of_it = [
+                    (each, None)
+                    for each, choice in zip(self.objects, choices, strict=True)
+                    if choice == landmark_id
+                ]
+                yield _assigned(of_it)
+                yield _assigned([(each, landmark_id) for each in supporters])
 
     def _revisable(self) -> list[TrackedObject]:
         """Objects whose choices are revised: tracks whose posterior contradicts it, and objects in the window.
@@ -461,24 +441,16 @@ class MixtureIdentities(IdentityPolicy):
         """Begin landmarks that began with something else where those that name them agree that they are."""
         moved = gtsam.Values(values)
         for landmark_id in sorted(_sizes(objects, choices)):
-            named = [each.posterior.favourite == landmark_id for each in objects]
-            naming = [
-                each for each, is_named in zip(objects, named, strict=True) if is_named
-            ]
-            present = [
-                choice
-                for choice, is_named in zip(choices, named, strict=True)
-                if is_named
-            ]
             supporters = supporters_elsewhere(
-                landmark_id, naming, present, values, self.mixture
+                landmark_id, objects, choices, values, self.mixture
             )
             if supporters is None:
                 continue
-            without = [None if choice == landmark_id else choice for choice in choices]
             choices = [
-                landmark_id if each in supporters else choice
-                for each, choice in zip(objects, without, strict=True)
+                landmark_id
+                if each in supporters
+                else (None if choice == landmark_id else choice)
+                for each, choice in zip(objects, choices, strict=True)
             ]
             first = min((s for each in supporters for s in each.sightings), key=_age)
             moved.update(L(landmark_id), self.landmarks.factors.start(first, values))

@@ -39,9 +39,8 @@ from sonar_graph.models import (
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
-    UNCHANGED,
     Assignment,
-    Decision,
+    Decisions,
     IdentityPolicy,
     LandmarkGraph,
 )
@@ -278,14 +277,13 @@ Candidate = list[Sighting]
 """Sightings that may be of one landmark, in the order of time."""
 
 
-class PairedDetection(NamedTuple):
-    """Landmark or candidate that a detection was paired with, or neither."""
+class PairedLandmark(NamedTuple):
+    """Landmark that a detection was paired with."""
 
-    landmark_id: int | None = None
-    candidate: Candidate | None = None
-    innovation: Floats | None = None
-    """Innovation against the landmark, shape (2,)."""
-    S: Floats | None = None
+    landmark_id: int
+    innovation: Floats
+    """Shape (2,)."""
+    S: Floats
     """Its covariance, shape (2, 2)."""
 
 
@@ -302,8 +300,6 @@ class NamelessLandmarks(IdentityPolicy):
             min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0
         )
         self._candidates: list[Candidate] = []
-        self._grown: list[Candidate] = []
-        """Candidates that the last frame shows."""
         self._next_id = FIRST_ANONYMOUS_ID
 
     def refuse_taken_ids(self, frame: LandmarkDetections) -> None:
@@ -316,81 +312,59 @@ class NamelessLandmarks(IdentityPolicy):
                 ' below that, or give it identity.unknown.policy = "ignore"'
             )
 
-    def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
-        """Give up sightings that have waited too long."""
-        return Decision.of(self.forget())
-
-    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
-        """Merge the nearest two landmarks that are one."""
+    def revise(self, frame: Frame | None) -> Decisions:  # noqa: ARG002
+        """Give up sightings that have waited too long; then merge the nearest two landmarks that are one."""
+        yield self.forget()
         ids = self.landmarks.ids
         if len(ids) < 2 or ids[-1] < FIRST_ANONYMOUS_ID:
-            return UNCHANGED
+            return
         joint = self.smoother.joint_covariance(
             [self._keyframes.newest_key, *self._keys()]
         )
         duplicates = nearest_duplicates(
             self.landmarks, self.smoother.estimates, joint, self._params
         )
-        if duplicates is None:
-            return UNCHANGED
-        stays, goes = duplicates
-        return Decision.of(
-            Assignment(s, Outcome.MOVED, stays) for s in self.landmarks.sightings(goes)
-        )
+        if duplicates is not None:
+            stays, goes = duplicates
+            merged = self.landmarks.sightings(goes)
+            yield [Assignment(s, Outcome.MOVED, stays) for s in merged]
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
         """All landmarks, and the keyframes of all candidates."""
         return self._keys()
 
-    def judge(self, seen: SeenFrame) -> Decision:
-        """Use paired detections; let the others wait, each with its candidate."""
-        self._grown = []
+    def judge(self, seen: SeenFrame) -> Decisions:
+        """Use paired detections; let the others wait, each with its candidate. Candidates that are placed are landmarks."""
         rows = list(range(len(seen.frame)))
         paired = self.pair(seen.view, seen.frame.z, seen.frame.noise, seen.taken)
         judged = []
-        for sighting, pair in zip(
-            seen.sightings(rows, seen.beam_points(rows)), paired, strict=True
-        ):
-            if pair.landmark_id is not None and pair.S is not None:
+        grown = []
+        for sighting, pair in zip(seen.sightings(rows), paired, strict=True):
+            if isinstance(pair, PairedLandmark):
                 # S = S_0 + R
                 gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0
-                judged.append(
-                    Assignment(
-                        sighting,
-                        Outcome.USED,
-                        pair.landmark_id,
-                        pair.innovation,
-                        pair.S,
-                        gain,
-                    )
-                )
+                judged.append(Assignment(sighting, Outcome.USED, *pair, gain))
                 continue
-            candidate = pair.candidate
-            if candidate is None:  # neither near a landmark nor near what waits
-                candidate = []
-                self._candidates.append(candidate)
-            candidate.append(sighting)
-            self._grown.append(candidate)
+            if pair is None:  # neither near a landmark nor near what waits
+                pair = []
+                self._candidates.append(pair)
+            pair.append(sighting)
+            grown.append(pair)
             judged.append(Assignment(sighting, Outcome.WAITING))
-        return Decision.of(judged)
-
-    def reconsider(self) -> Decision:
-        """Begin a landmark of the next candidate that is placed well enough."""
-        while self._grown:
-            candidate = self._grown.pop(0)
+        yield judged
+        for candidate in grown:
             if self.is_placed(candidate):
                 self._candidates.remove(candidate)
-                landmark_id = self._next_id
-                self._next_id += 1
                 *earlier, newest = candidate
-                later = [
-                    Assignment(sighting, Outcome.PLACED_LATER, landmark_id)
-                    for sighting in earlier
+                placed = [
+                    *(
+                        Assignment(s, Outcome.PLACED_LATER, self._next_id)
+                        for s in earlier
+                    ),
+                    Assignment(newest, Outcome.NEW, self._next_id),
                 ]
-                return Decision.of(
-                    [*later, Assignment(newest, Outcome.NEW, landmark_id)]
-                )
-        return UNCHANGED
+                self._next_id += 1
+                yield placed
 
     def is_placed(self, candidate: Candidate) -> bool:
         """True when a candidate has enough sightings, which place it well enough."""
@@ -425,8 +399,8 @@ class NamelessLandmarks(IdentityPolicy):
 
     def pair(
         self, view: PredictedView, z: Floats, noise: Floats, taken: Set[int]
-    ) -> list[PairedDetection]:
-        """Pair each detection of a frame with a landmark, or else with a candidate.
+    ) -> list[PairedLandmark | Candidate | None]:
+        """Pair each detection of a frame with a landmark, or else with a candidate, or with neither.
 
         Parameters
         ----------
@@ -443,7 +417,7 @@ class NamelessLandmarks(IdentityPolicy):
             source(candidate[-1], values, self.landmarks.factors)
             for candidate in self._candidates
         ]
-        paired = [PairedDetection()] * len(z)
+        paired: list[PairedLandmark | Candidate | None] = [None] * len(z)
         if not keys and not sources:
             return paired
         expected, P = view.expect_jointly(keys, points, sources)
@@ -453,15 +427,12 @@ class NamelessLandmarks(IdentityPolicy):
         innovations = Innovations(e[:, :n], P[: 2 * n, : 2 * n], noise)
         of_landmarks = self._choose(innovations, z)
         for i, j in of_landmarks.items():
-            S = (
-                innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
-                + noise[i]
-            )
-            paired[i] = PairedDetection(ids[j], None, innovations.innovation[i, j], S)
+            of_j = slice(2 * j, 2 * j + 2)
+            paired[i] = PairedLandmark(ids[j], e[i, j], P[of_j, of_j] + noise[i])
         left = [i for i in range(len(z)) if i not in of_landmarks]
         innovations = Innovations(e[left, n:], P[2 * n :, 2 * n :], noise[left])
         for i, j in self._choose(innovations, z[left]).items():
-            paired[left[i]] = PairedDetection(None, self._candidates[j])
+            paired[left[i]] = self._candidates[j]
         return paired
 
     def _choose(self, innovations: Innovations, z: Floats) -> dict[int, int]:

@@ -311,38 +311,6 @@ class JointCovariance:
         return self.matrix[i : i + tangent_size(a), j : j + tangent_size(b)]
 
 
-class KeptCovariance:
-    """One joint covariance for all questions between two updates.
-
-    Each joint covariance costs an elimination of most of the map, however small it is. So the first one after an update
-    includes the landmarks that the next frame is likely to show.
-    """
-
-    def __init__(self) -> None:
-        self._joint: JointCovariance | None = None
-        self._asked: set[int] = set()
-
-    def of(
-        self,
-        marginals: Marginals | gtsam.ISAM2,
-        keys: list[int],
-        likely: Callable[[], list[int]],
-    ) -> JointCovariance:
-        """Joint covariance of these variables, and possibly of more; ``likely`` names those that are needed next."""
-        # the next joint covariance includes all variables since the update, so that no question is repeated
-        self._asked.update(keys)
-        if self._joint is None or not self._joint.rows.keys() >= self._asked:
-            self._joint = JointCovariance.of(
-                marginals, sorted(self._asked.union(likely()))
-            )
-        return self._joint
-
-    def renew(self) -> None:
-        """The graph has changed."""
-        self._joint = None
-        self._asked = set()
-
-
 class Marginals:
     """Marginal covariances of a graph, linearised at the values; by QR where Cholesky refuses.
 

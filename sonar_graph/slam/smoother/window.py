@@ -216,10 +216,6 @@ class WholeWindow:
         kept = {handle: beside[handle] for handle in sorted(beside.keys() - removed)}
         return sorted(slots), kept
 
-    def holds(self, key: int) -> bool:
-        """True for a variable in the window."""
-        return self.isam.valueExists(key)
-
     def largest_shift(self, keys: Sequence[int]) -> float:
         """Largest component by which some variables have moved from their linearisation point, rad or m."""
         if not keys:
@@ -328,14 +324,9 @@ class FixedLagWindow:
         """The solver inside, for covariances; a copy."""
         return self._fixed_lag.getISAM2()
 
-    def holds(self, key: int) -> bool:
-        """True for a variable in the window."""
-        return self.linearised_at.exists(key)
-
-    def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
-        """Estimate of some variables, or of all."""
-        values = self._fixed_lag.calculateEstimate()
-        return values if keys is None else picked(values, keys)
+    def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:  # noqa: ARG002
+        """Estimate of all variables, since GTSAM's smoother gives no part of it."""
+        return self._fixed_lag.calculateEstimate()
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """Marginals and factors of the window.
