@@ -11,7 +11,8 @@ One call of `Isam2.process`::
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
+from operator import itemgetter
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import gtsam
 import numpy as np
@@ -105,11 +106,8 @@ class Isam2Params(Section):
         return self
 
 
-class Event(NamedTuple):
-    """A frame or a fix, and the call that takes it in."""
-
-    stamp_ns: int
-    apply: Callable[[], None]
+Event = tuple[int, Callable[[], None]]
+"""Stamp of a frame or a fix, and the call that takes it in."""
 
 
 class Isam2:
@@ -198,15 +196,15 @@ class Isam2:
         )
         if is_late:
             # a fix may be tied to an earlier keyframe, but the motion to an earlier frame is no longer kept
-            for event in events:
-                event.apply()
+            for _, take_in in events:
+                take_in()
             self._refuse_late(measurements.detections)
             return None
         # frames before fixes of the same stamp, because the sort is stable
         events = self._frame_events(measurements.detections) + events
-        for event in sorted(events, key=lambda event: event.stamp_ns):
-            self._frontend.advance(event.stamp_ns)
-            event.apply()
+        for stamp_ns, take_in in sorted(events, key=itemgetter(0)):
+            self._frontend.advance(stamp_ns)
+            take_in()
         self._frontend.advance(measurements.end_ns)
         if self._keyframes.newest_ns is None:
             return None
@@ -228,7 +226,7 @@ class Isam2:
         if detections is None:
             return []
         return [
-            Event(int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
+            (int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
             for frame in detections.frames()
         ]
 
@@ -238,7 +236,7 @@ class Isam2:
             return []
         known = self._keyframes.calibration.positions
         is_sound = positions.are_sound()
-        events = []
+        events: list[Event] = []
         for k, stamp_ns in enumerate(positions.stamps_ns.tolist()):
             if not is_sound[k]:
                 self._keyframes.refuse("positions", stamp_ns, Refusal.UNSOUND)
@@ -247,17 +245,8 @@ class Isam2:
             # the receiver gave none: the calibration's noise holds
             if np.isnan(cov_m2).any():
                 cov_m2 = np.diag(np.square(known.sigma_m))
-            events.append(
-                Event(
-                    stamp_ns,
-                    partial(
-                        self._frontend.add_fix,
-                        stamp_ns,
-                        positions.position_m[k],
-                        cov_m2,
-                    ),
-                )
-            )
+            fix = (stamp_ns, positions.position_m[k], cov_m2)
+            events.append((stamp_ns, partial(self._frontend.add_fix, *fix)))
         return events
 
     def _refuse_late(self, detections: LandmarkDetections | None) -> None:
@@ -398,17 +387,13 @@ class Isam2:
     def _require_in_window(self, numbers: list[int]) -> None:
         """Refuse keyframes that have left a bounded window."""
         newest = self.keyframe_count - 1
-        left = [
-            number for number in numbers if not self._smoother.in_window([X(number)])
-        ]
-        if left:
-            first = next(
-                (k for k in range(newest) if self._smoother.in_window([X(k)])), newest
-            )
-            raise EstimatorError(
-                f"isam2: keyframe {left[0]} has left the window, which holds {first} to {newest}; none is known any"
-                ' more; history.policy = "whole" keeps all'
-            )
+        for number in numbers:
+            if not self._smoother.in_window([X(number)]):
+                inside = (k for k in range(newest) if self._smoother.in_window([X(k)]))
+                raise EstimatorError(
+                    f"isam2: keyframe {number} has left the window, which holds {next(inside, newest)} to {newest};"
+                    ' none is known any more; history.policy = "whole" keeps all'
+                )
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.

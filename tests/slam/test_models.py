@@ -216,7 +216,7 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
     noise = cov(0.02, 0.01, by_noise)
     z = np.array([[3.0 + range_off, measured]])
     predicted = np.array([[3.0, expected]])
-    (innovation,), (S,), (distance,), (gain,) = weigh(z, predicted, prior, noise[None])
+    (innovation,), (S,), (distance,), (gain,) = weigh(z, predicted, prior[None], noise[None])
     assert innovation[0] == pytest.approx(range_off)
     assert abs(innovation[1]) <= np.pi + 1e-12
     assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)

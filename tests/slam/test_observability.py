@@ -181,7 +181,7 @@ def begun(*, is_bounded: bool = False) -> Smoother:
     smoother.add_landmark(L(3), np.array([4.0, 1.0, 0.5]))
     smoother.add({"prior": point_prior(L(3), [4.1, 1.0, 0.5])})
     smoother.add({"range": range_factor(0, 3, 4.3)})
-    smoother.update(0.0)
+    smoother.update()
     step(smoother, 1)
     return smoother
 
@@ -191,7 +191,7 @@ def step(smoother: Smoother, k: int, more: Factors | None = None) -> None:
     smoother.add({"odometry": gtsam.BetweenFactorPose3(X(k - 1), X(k), STEP, SIGMAS)})
     smoother.add({"range": range_factor(k, 3, 4.0 - 0.7 * k)})
     smoother.add(more or {})
-    smoother.update(float(k))
+    smoother.update()
 
 
 def same(one: Smoother, other: Smoother, tolerance: float = 1e-9) -> None:
@@ -260,14 +260,14 @@ def test_what_has_no_solution_is_withheld_by_name_whichever_way_it_comes(
     if not way.startswith("update"):
         step(smoother, 2)
     if way == "exchange":
-        smoother.exchange(2.0, (), [FactorGroup(new)], landmarks)
-        other.exchange(2.0, (), [FactorGroup({})])
+        smoother.exchange((), [FactorGroup(new)], landmarks)
+        other.exchange((), [FactorGroup({})])
     elif landmarks:
         smoother.add_landmark(L(7), POINT)
     if way == "flush":
         smoother.add(new)
-        smoother.flush(2.0)
-        other.flush(2.0)
+        smoother.flush()
+        other.flush()
     elif way != "exchange":
         step(smoother, 2, new)
     for k in range(3, 6):
@@ -288,4 +288,4 @@ def test_a_keyframe_without_odometry_is_named_with_what_is_missing():
         EstimatorError,
         match=r"keyframe 2 at 2\.000 s: 1 range; open: .*; odometry from another",
     ):
-        smoother.update(2.0)
+        smoother.update()

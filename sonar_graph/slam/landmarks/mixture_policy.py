@@ -316,7 +316,7 @@ class MixtureIdentities(IdentityPolicy):
             )
             if supporters is not None:
                 # a landmark begins in a new place only after it has lost its last sighting
-                of_it = [
+                of_it: Changes = [
                     (each, None)
                     for each, choice in zip(self.objects, choices, strict=True)
                     if choice == landmark_id

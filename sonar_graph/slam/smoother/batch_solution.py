@@ -11,15 +11,17 @@ sightings start it again (docs/theory/isam2.md).
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.slam.factors import CorrelatedSighting, SightingStack
+from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
 from sonar_graph.slam.smoother.factor_store import (
     Known,
     Sightlines,
@@ -40,31 +42,26 @@ DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
 
 
-class Stack(Protocol):
-    """Many factors of one kind, evaluated as arrays."""
-
-    def __init__(self, factors: Sequence[Any]) -> None: ...
-
-    def error(self, values: gtsam.Values) -> float:
-        """Half the sum of squared whitened errors."""
-
-    def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
-        """What linearising each of them gives."""
+STACKS: dict[type, type[OdometryStack] | type[SightingStack]] = {
+    OdometryWithBias: OdometryStack,
+    CorrelatedSighting: SightingStack,
+}
+"""Factors in Python, and the class that evaluates many of them as arrays."""
 
 
 class StackedGraph:
-    """A graph whose factors in Python are evaluated together, where their class has a `Stack`."""
+    """A graph whose factors in Python are evaluated together (`STACKS`)."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
         self.factors = [graph.at(i) for i in range(graph.size())]
         self._rest = gtsam.NonlinearFactorGraph()
-        kinds: dict[type[Stack], list[gtsam.NonlinearFactor]] = defaultdict(list)
+        kinds: dict[type, list[Any]] = defaultdict(list)
         for factor in self.factors:
-            if kind := getattr(factor, "Stack", None):
-                kinds[kind].append(factor)
+            if type(factor) in STACKS:
+                kinds[type(factor)].append(factor)
             else:
                 self._rest.add(factor)
-        self._stacks = [kind(members) for kind, members in kinds.items()]
+        self._stacks = [STACKS[kind](members) for kind, members in kinds.items()]
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squared errors."""
@@ -75,10 +72,9 @@ class StackedGraph:
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """All factors, linearised."""
         linear = self._rest.linearize(values)
-        for factor in (
-            factor for stack in self._stacks for factor in stack.linear_factors(values)
-        ):
-            linear.push_back(factor)
+        for stack in self._stacks:
+            for factor in stack.linear_factors(values):
+                linear.push_back(factor)
         return linear
 
 
@@ -172,14 +168,6 @@ def doubled(
         error = further_error
 
 
-def prior_of(key: int, weight: float) -> gtsam.JacobianFactor:
-    """A linear factor by which a variable stays where it is, each component with a standard deviation of 1 / weight."""
-    n = tangent_size(key)
-    return gtsam.JacobianFactor(
-        key, weight * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)
-    )
-
-
 def damped_step(
     linear: gtsam.GaussianFactorGraph,
     values: gtsam.Values,
@@ -192,7 +180,10 @@ def damped_step(
     if damping > FIRST_DAMPING:
         damped = linear.clone()
         for key in linear.keyVector():
-            damped.push_back(prior_of(key, np.sqrt(damping)))
+            n = tangent_size(key)
+            unit = gtsam.noiseModel.Unit.Create(n)
+            A = np.sqrt(damping) * np.eye(n)
+            damped.push_back(gtsam.JacobianFactor(key, A, np.zeros(n), unit))
     try:
         return damped.eliminateSequential(ordering).optimize()
     except RuntimeError:  # Cholesky refuses what is determined, but weakly

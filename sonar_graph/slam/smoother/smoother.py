@@ -261,11 +261,9 @@ class Smoother:
         self._taken_up = gtsam.NonlinearFactorGraph()
 
     def _empty_window(self) -> WholeWindow | FixedLagWindow:
-        if isinstance(self.history, BoundedHistory):
-            return FixedLagWindow(
-                self._thresholds, self.params.lag_s, is_by_qr=self._is_by_qr
-            )
-        return WholeWindow(self._thresholds, is_by_qr=self._is_by_qr)
+        is_bounded = isinstance(self.history, BoundedHistory)
+        kind = FixedLagWindow if is_bounded else WholeWindow
+        return kind(self._thresholds, is_by_qr=self._is_by_qr)
 
     # ---------------------------------------------------------------- what the graph is made of
 
