@@ -122,7 +122,7 @@ class CorrelatedSighting(gtsam.CustomFactor):
 
 
 class SightingStack:
-    """Many `CorrelatedSighting` as arrays (`batch_solution.Stack`); the same numbers to rounding."""
+    """Many `CorrelatedSighting` as arrays (`batch_solution.STACKS`); the same numbers to rounding."""
 
     def __init__(self, factors: Sequence[CorrelatedSighting]) -> None:
         laws = [factor.law for factor in factors]
@@ -279,7 +279,7 @@ def landmark_sighting(
     cov: Floats,
     robust: Robust | None = None,
     elevation_sigma_rad: float | None = None,
-) -> dict[str, gtsam.NoiseModelFactor]:
+) -> dict[str, gtsam.NonlinearFactor]:
     """Range and azimuth of a landmark, by their labels in messages; all of them belong in the graph.
 
     Parameters
@@ -327,11 +327,8 @@ def landmark_sighting(
     both = CorrelatedSighting(
         pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov))
     )
-    return (
-        {"elevation": camera, "range and azimuth": both}
-        if elevation_sigma_rad
-        else {"range and azimuth": both}
-    )
+    of_elevation = {"elevation": camera} if elevation_sigma_rad else {}
+    return of_elevation | {"range and azimuth": both}
 
 
 def first_direction(

@@ -190,19 +190,20 @@ class Isam2:
             measurements.imu, measurements.dvl, measurements.depth, measurements.heading
         )
         events = self._fix_events(measurements.positions)
-        is_late = (
-            self._poses.newest_ns is not None
-            and measurements.end_ns < self._poses.newest_ns
-        )
-        if is_late:
+        newest_ns = self._poses.newest_ns
+        if newest_ns is not None and measurements.end_ns < newest_ns:
             # a fix may be tied to an earlier keyframe, but the motion to an earlier frame is no longer kept
             for _, take_in in events:
                 take_in()
             self._refuse_late(measurements.detections)
             return None
         # frames before fixes of the same stamp, because the sort is stable
-        events = self._frame_events(measurements.detections) + events
-        for stamp_ns, take_in in sorted(events, key=itemgetter(0)):
+        detections = measurements.detections
+        frames: list[Event] = [
+            (int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
+            for frame in (detections.frames() if detections is not None else ())
+        ]
+        for stamp_ns, take_in in sorted(frames + events, key=itemgetter(0)):
             self._frontend.advance(stamp_ns)
             take_in()
         self._frontend.advance(measurements.end_ns)
@@ -220,15 +221,6 @@ class Isam2:
         self._poses.add(instant)
         joint = self._smoother.joint_covariance(instant.tie.keys)
         return instant.carried_on(self._smoother.estimates, joint)
-
-    def _frame_events(self, detections: LandmarkDetections | None) -> list[Event]:
-        """Frames of detections, each with the call that takes it in."""
-        if detections is None:
-            return []
-        return [
-            (int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
-            for frame in detections.frames()
-        ]
 
     def _fix_events(self, positions: PositionFixes | None) -> list[Event]:
         """Valid position fixes, each with the call that adds it to the graph."""

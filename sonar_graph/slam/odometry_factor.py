@@ -79,7 +79,7 @@ class OdometryError:
         self.D[:3] -= np.outer(up_j, self.h)
         self._motion = (self.i_T_j[None], self.D[None], self.h[None], UNWHITENED)
         # GTSAM calls thousands of times: results are written into arrays made once
-        self._result = OdometryDerivatives.empty(1, len(self.h))
+        self._result = to_be_filled(1, len(self.h))
 
     def __call__(
         self,
@@ -95,12 +95,11 @@ class OdometryError:
         change = (values.atVector(bias_key) - self.bias_0)[None]  # (1, 11)
         if jacobians is None:
             return odometry_errors(X_i, X_j, change, self._motion)[0]
-        found = self._result
-        write_derivatives(X_i, X_j, change, self._motion, (*found,))
-        jacobians[0] = found.by_i[0].T  # back to rows
-        jacobians[1] = found.by_j[0].T
-        jacobians[2] = found.by_b[0].T
-        return found.errors[0]
+        write_derivatives(X_i, X_j, change, self._motion, self._result)
+        errors, *columns = self._result
+        for k, transposed in enumerate(columns):
+            jacobians[k] = transposed[0].T  # back to rows
+        return errors[0]
 
 
 class OdometryWithBias(gtsam.CustomFactor):
@@ -131,31 +130,23 @@ BiasedMotions = tuple[Floats, Floats, Floats, Floats]
 shape (n, 6, 6)."""
 
 
-class OdometryDerivatives(NamedTuple):
-    """Errors of n motions, and their derivatives, transposed."""
+OdometryDerivatives = tuple[Floats, Floats, Floats, Floats]
+"""Errors of n motions, shape (n, 6), and their derivatives, transposed: by the first pose and by the second, shape
+(n, 6, 6), and by b, shape (n, 11, 6)."""
 
-    errors: Floats
-    """Shape (n, 6)."""
-    by_i: Floats
-    """By the first pose, shape (n, 6, 6)."""
-    by_j: Floats
-    """By the second pose, shape (n, 6, 6)."""
-    by_b: Floats
-    """By b, shape (n, 11, 6)."""
 
-    @classmethod
-    def empty(cls, n: int, biases: int) -> OdometryDerivatives:
-        """Arrays to be filled."""
-        return cls(
-            np.empty((n, 6)),
-            np.empty((n, 6, 6)),
-            np.empty((n, 6, 6)),
-            np.empty((n, biases, 6)),
-        )
+def to_be_filled(n: int, biases: int) -> OdometryDerivatives:
+    """Arrays for the derivatives of n motions."""
+    return (
+        np.empty((n, 6)),
+        np.empty((n, 6, 6)),
+        np.empty((n, 6, 6)),
+        np.empty((n, biases, 6)),
+    )
 
 
 class OdometryStack:
-    """Many `OdometryWithBias`, evaluated together as arrays (`batch_solution.Stack`); the same numbers to rounding."""
+    """Many `OdometryWithBias`, evaluated together as arrays (`batch_solution.STACKS`); the same numbers to rounding."""
 
     def __init__(self, factors: Sequence[OdometryWithBias]) -> None:
         laws = [factor.law for factor in factors]
@@ -181,8 +172,8 @@ class OdometryStack:
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised."""
-        found = OdometryDerivatives.empty(*self._motions[2].shape)
-        write_derivatives(*self._states(values), self._motions, (*found,))
+        found = to_be_filled(*self._motions[2].shape)
+        write_derivatives(*self._states(values), self._motions, found)
         e, *columns = found
         # stored by columns, as GTSAM stores them
         blocks = (transposed.transpose(0, 2, 1) for transposed in columns)
@@ -221,7 +212,7 @@ def write_derivatives(
     X_j: Floats,
     changes: Floats,
     motions: BiasedMotions,
-    linear: tuple[Floats, Floats, Floats, Floats],
+    linear: OdometryDerivatives,
 ) -> None:
     """As `odometry_errors`; fills the arrays of `OdometryDerivatives`."""
     i_T_j, D, h, whitening = motions

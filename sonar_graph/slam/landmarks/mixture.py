@@ -37,8 +37,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.models import Kernel, polar_difference, project_points
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.smoother import Known
-from sonar_graph.slam.smoother.factor_store import sighted_from
+from sonar_graph.slam.smoother import Known, sighted_from
 
 REPEATED_LOSS = 3.0
 """Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""

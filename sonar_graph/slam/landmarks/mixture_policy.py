@@ -45,7 +45,7 @@ from sonar_graph.slam.landmarks.tracked import (
     RobustIdentity,
     second_rows_of_tracks,
 )
-from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
+from sonar_graph.slam.smoother import Marginals, solve_in_sight
 from sonar_graph.states import Outcome
 
 MOST_WINDOW_ROUNDS = 3
@@ -87,6 +87,10 @@ IdentityParams = Annotated[
 ]
 Changes = list[tuple[TrackedObject, int | None]]
 """Tracked objects with the landmark that each is to count as; None: no landmark."""
+
+
+SightingsOf = dict[int, list[Sighting]]
+"""Sightings of each landmark."""
 
 
 class ChosenHistory(NamedTuple):
@@ -150,7 +154,7 @@ class MixtureIdentities(IdentityPolicy):
         """
         frame = seen.frame
         rows = list(range(len(frame)))
-        tracks = frame.detections.track.tolist()
+        tracks = frame.tracks
         posteriors = [IdentityPosterior.of(frame.detections, row) for row in rows]
         ids = [gtsam.Symbol(key).index() for key in seen.keys]
         points = np.array(
@@ -407,25 +411,23 @@ class MixtureIdentities(IdentityPolicy):
             for each in objects
             for sighting in each.sightings
         }
-        rest = self.smoother.graph_without(
-            {handle for handle in handles if handle is not None}
-        )
+        rest = self.smoother.graph_without(handles)
         values = solved
         choices = [self.landmark_of(each) for each in objects]
         for _ in range(MOST_HISTORY_ROUNDS):
             # first the choices at the solution; when they are stable, the places of landmarks
             start = values
-            better = self.mixture.best(
-                objects, values, choices, _sizes(objects, choices)
-            )
+            sizes = {i: len(s) for i, s in _sightings_of(objects, choices).items()}
+            better = self.mixture.best(objects, values, choices, sizes)
             if better == choices:
                 start, better = self._relocated(objects, values, choices)
             if better == choices:
                 break
-            values = self.solution(rest, objects, start, better)
+            values = self._solution(rest, _sightings_of(objects, better), start)
             choices = better
         if values is not solved:  # else those of the run's own graph hold
-            marginals = Marginals(self.graph(rest, objects, choices), values)
+            graph = self._graph(rest, _sightings_of(objects, choices))
+            marginals = Marginals(graph, values)
         return ChosenHistory(values, marginals, objects, choices)
 
     def _is_withheld(self, each: TrackedObject) -> bool:
@@ -440,7 +442,7 @@ class MixtureIdentities(IdentityPolicy):
     ) -> tuple[gtsam.Values, Choices]:
         """Begin landmarks that began with something else where those that name them agree that they are."""
         moved = gtsam.Values(values)
-        for landmark_id in sorted(_sizes(objects, choices)):
+        for landmark_id in sorted(_sightings_of(objects, choices)):
             supporters = supporters_elsewhere(
                 landmark_id, objects, choices, values, self.mixture
             )
@@ -456,45 +458,33 @@ class MixtureIdentities(IdentityPolicy):
             moved.update(L(landmark_id), self.landmarks.factors.start(first, values))
         return moved, choices
 
-    def solution(
+    def _solution(
         self,
         rest: gtsam.NonlinearFactorGraph,
-        objects: list[TrackedObject],
+        of: SightingsOf,
         values: gtsam.Values,
-        choices: Choices,
     ) -> gtsam.Values:
-        """Solution of the history in which each tracked object is the landmark chosen for it."""
+        """Solution of the history in which each landmark has these sightings."""
         start = gtsam.Values(values)
-        lines: dict[int, list[Sightline]] = defaultdict(list)
-        for each, choice in zip(objects, choices, strict=True):
-            if choice is None:
-                continue
-            lines[L(choice)] += [sighting.line for sighting in each.sightings]
+        for i, sightings in of.items():
             # a landmark that the run does not have begins where its first object has it
-            if not start.exists(L(choice)):
-                start.insert(
-                    L(choice), self.landmarks.factors.start(each.sightings[0], values)
-                )
-        return solve_in_sight(self.graph(rest, objects, choices), start, lines)
+            if not start.exists(L(i)):
+                place = self.landmarks.factors.start(sightings[0], values)
+                start.insert(L(i), place)
+        lines = {L(i): [s.line for s in sightings] for i, sightings in of.items()}
+        return solve_in_sight(self._graph(rest, of), start, lines)
 
-    def graph(
-        self,
-        rest: gtsam.NonlinearFactorGraph,
-        objects: list[TrackedObject],
-        choices: Choices,
+    def _graph(
+        self, rest: gtsam.NonlinearFactorGraph, of: SightingsOf
     ) -> gtsam.NonlinearFactorGraph:
-        """All factors, those of sightings as chosen."""
+        """All factors, with those of these sightings of each landmark."""
         graph = gtsam.NonlinearFactorGraph(rest)
-        of: dict[int, list[Sighting]] = defaultdict(list)
-        for each, choice in zip(objects, choices, strict=True):
-            if choice is not None:
-                of[choice] += each.sightings
-        for landmark_id, sightings in of.items():
+        for i, sightings in of.items():
             # as in `LandmarkGraph`, the earliest has the factors that a landmark has once
-            for k, sighting in enumerate(sorted(sightings, key=_age)):
-                for factor in self.landmarks.factors.make(
-                    sighting, L(landmark_id), is_first=k == 0
-                ).values():
+            first = min(sightings, key=_age)
+            for s in sorted(sightings, key=_age):
+                made = self.landmarks.factors.make(s, L(i), is_first=s is first)
+                for factor in made.values():
                     graph.add(factor)
         return graph
 
@@ -521,10 +511,10 @@ def _age(sighting: Sighting) -> tuple[int, int]:
     return sighting.stamp_ns, sighting.row
 
 
-def _sizes(objects: list[TrackedObject], choices: Choices) -> dict[int, int]:
-    """Number of sightings of each chosen landmark."""
-    sizes: dict[int, int] = defaultdict(int)
+def _sightings_of(objects: list[TrackedObject], choices: Choices) -> SightingsOf:
+    """Sightings of each chosen landmark."""
+    of: SightingsOf = defaultdict(list)
     for each, choice in zip(objects, choices, strict=True):
         if choice is not None:
-            sizes[choice] += len(each.sightings)
-    return sizes
+            of[choice] += each.sightings
+    return of

@@ -70,17 +70,15 @@ class SightingFactors:
             self.elevation_sigma_rad if is_first and sighting.floor is None else None
         )
         # once for each landmark, and only where no floor gives the height
-        made: Factors = {
-            **factors.landmark_sighting(
-                line.pose_key,
-                key,
-                line.body_T_sonar,
-                line.z,
-                sighting.noise,
-                self._robust,
-                elevation,
-            )
-        }
+        made = factors.landmark_sighting(
+            line.pose_key,
+            key,
+            line.body_T_sonar,
+            line.z,
+            sighting.noise,
+            self._robust,
+            elevation,
+        )
         if is_first:
             # in the keyframe's body frame
             body_p_landmark = locate(
@@ -108,12 +106,11 @@ class SightingFactors:
         """Elevation (rad) of a floor at a range and azimuth; 0 without a floor in the aperture."""
         if floor is None:
             return 0.0
-        return (
-            elevation_on_floor(
-                world_T_sonar, float(z[0]), float(z[1]), floor.z_m, self._aperture_rad
-            )
-            or 0.0
+        range_m, azimuth_rad = z.tolist()
+        found = elevation_on_floor(
+            world_T_sonar, range_m, azimuth_rad, floor.z_m, self._aperture_rad
         )
+        return found or 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,59 +117,47 @@ def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
     ``probability``: chance that a true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of
     freedom.
     """
-    search = _Search(innovations, probability)
-    search.branch(0, search.best)
-    return search.best
+    count = len(innovations.innovation)
+    gates = [0.0] + [
+        chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
+    ]
+    # a pair that is incompatible alone stays so in every pairing; landmarks from near to far
+    possible = [
+        [j for j in np.argsort(row).tolist() if row[j] <= gates[1]]
+        for row in innovations.distances()
+    ]
+    # depth first, detections with the fewest possible landmarks first
+    order = sorted(
+        range(count), key=lambda i: (len(possible[i]) == 0, len(possible[i]))
+    )
+    left = [sum(bool(possible[i]) for i in order[depth:]) for depth in range(count + 1)]
+    """Number of detections at each depth and below that are compatible with a landmark."""
+    best = Pairing((UNPAIRED,) * count, 0.0)
 
-
-class _Search:
-    """Depth first, detections with the fewest possible landmarks first, landmarks from near to far."""
-
-    def __init__(self, innovations: Innovations, probability: float) -> None:
-        count = len(innovations.innovation)
-        self._innovations = innovations
-        self._gates = [0.0] + [
-            chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
-        ]
-        # a pair that is incompatible alone stays so in every pairing
-        self._possible = [
-            [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]]
-            for row in innovations.distances()
-        ]
-        self._order = sorted(
-            range(count),
-            key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])),
-        )
-        self._left = [
-            sum(bool(self._possible[i]) for i in self._order[depth:])
-            for depth in range(count + 1)
-        ]
-        """Number of detections at each depth and below that are compatible with a landmark."""
-        self.best = Pairing((UNPAIRED,) * count, 0.0)
-
-    def branch(self, depth: int, part: Pairing) -> None:
+    def branch(depth: int, part: Pairing) -> None:
         """Try all pairings that extend a part of one."""
-        best = self.best
-        if (part.size, -part.distance) > (
-            best.size,
-            -best.distance,
-        ) and part.distance <= self._gates[part.size]:
-            self.best = part
-        if self._left[depth] == 0:
+        nonlocal best
+        is_better = (part.size, -part.distance) > (best.size, -best.distance)
+        if is_better and part.distance <= gates[part.size]:
+            best = part
+        if left[depth] == 0:
             return
         # bound: D² only grows with pairs, so that a pairing of equal size cannot come below it any more
-        reach = part.size + self._left[depth]
-        if (reach, -part.distance) <= (self.best.size, -self.best.distance):
+        reach = part.size + left[depth]
+        if (reach, -part.distance) <= (best.size, -best.distance):
             return
-        i = self._order[depth]
-        for j in self._possible[i]:
+        i = order[depth]
+        for j in possible[i]:
             if j not in part.landmarks:
-                more = self._innovations.pairing(
+                more = innovations.pairing(
                     (*part.landmarks[:i], j, *part.landmarks[i + 1 :])
                 )
-                if more.distance <= self._gates[reach]:
-                    self.branch(depth + 1, more)
-        self.branch(depth + 1, part)
+                if more.distance <= gates[reach]:
+                    branch(depth + 1, more)
+        branch(depth + 1, part)
+
+    branch(0, best)
+    return best
 
 
 def drop_unlikely(
@@ -466,20 +454,14 @@ def nearest_duplicates(
     noise = {i: _noise_m2(landmarks.any_sighting(i)) for i in landmarks.ids}
     d = np.array([points[a] - points[b] for a, b in pairs])  # (k, 3)
     sigma2 = np.array([max(noise[a], noise[b]) for a, b in pairs])
-    # (k, 3)
-    of_a = np.array([covariance.rows[L(a)] for a, _ in pairs])[:, None] + np.arange(3)
-    of_b = np.array([covariance.rows[L(b)] for _, b in pairs])[:, None] + np.arange(3)
-
-    def P(i: NDArray[np.int64], j: NDArray[np.int64]) -> Floats:
-        return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
-
-    S = (
-        P(of_a, of_a)
-        + P(of_b, of_b)
-        - P(of_a, of_b)
-        - P(of_b, of_a)
-        + sigma2[:, None, None] * np.eye(3)
+    of_a, of_b = (
+        np.array([covariance.rows[L(i)] for i in ids])[:, None] + np.arange(3)
+        for ids in zip(*pairs, strict=True)
     )
+    rows = np.concatenate((of_a, of_b), axis=1)  # (k, 6)
+    P = covariance.matrix[rows[:, :, None], rows[:, None, :]]  # (k, 6, 6)
+    apart = np.hstack((np.eye(3), -np.eye(3)))
+    S = apart @ P @ apart.T + sigma2[:, None, None] * np.eye(3)
     # d' S^-1 d
     distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
     for k in np.argsort(distance).tolist():

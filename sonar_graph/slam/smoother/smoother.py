@@ -290,7 +290,7 @@ class Smoother:
         """The newest estimate of all variables in the window; a copy."""
         return self.estimates.all()
 
-    def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
+    def graph_without(self, handles: set[int | None]) -> gtsam.NonlinearFactorGraph:
         """Every factor of a run with a whole history but those of some handles."""
         return self._store.graph(left_out=handles)
 
@@ -442,7 +442,7 @@ class Smoother:
         self._iterate(LEAST_ITERATED)
         if self.is_bounded:
             # marginals stay linearised where their poses left
-            shift_m = self._window.largest_shift(self._landmarks)
+            shift_m = self._largest_shift(self._landmarks)
             if (
                 now_s >= self._restarted_s + self.params.lag_s
                 and shift_m > self.params.stale_shift_m
@@ -516,7 +516,11 @@ class Smoother:
         keys = list(self._landmarks)
         if self._newest_pose is not None:
             keys.append(self._newest_pose)
-        return self._window.largest_shift(keys)
+        return self._largest_shift(keys)
+
+    def _largest_shift(self, keys: list[int]) -> float:
+        """Largest component by which some variables have moved from their linearisation point, rad or m."""
+        return float(np.abs(self._window.delta().vector(keys)).max()) if keys else 0.0
 
     def _has_diverged(self) -> bool:
         """True when the estimate has a larger error than the linearisation point, from which the step started."""

@@ -216,12 +216,9 @@ class WholeWindow:
         kept = {handle: beside[handle] for handle in sorted(beside.keys() - removed)}
         return sorted(slots), kept
 
-    def largest_shift(self, keys: Sequence[int]) -> float:
-        """Largest component by which some variables have moved from their linearisation point, rad or m."""
-        if not keys:
-            return 0.0
-        # GTSAM returns a reference, not a copy
-        return float(np.abs(self.isam.getDelta().vector(keys)).max())
+    def delta(self) -> gtsam.VectorValues:
+        """Change of each variable since its linearisation point; a reference."""
+        return self.isam.getDelta()
 
     def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
         """Estimate of some variables, or of all."""
@@ -342,11 +339,9 @@ class FixedLagWindow:
                 graph.add(factor)
         return graph
 
-    def largest_shift(self, keys: Sequence[int]) -> float:
-        """Largest component by which some variables have moved from their linearisation point, rad or m."""
-        if not keys:
-            return 0.0
-        return float(np.abs(self._fixed_lag.getDelta().vector(keys)).max())
+    def delta(self) -> gtsam.VectorValues:
+        """Change of each variable since its linearisation point."""
+        return self._fixed_lag.getDelta()
 
 
 def marginal(
