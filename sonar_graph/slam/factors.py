@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
@@ -108,6 +108,7 @@ class CorrelatedSighting(gtsam.CustomFactor):
     """
 
     __slots__ = ("law",)
+    Stack: ClassVar[type[SightingStack]]
 
     def __init__(
         self,
@@ -122,7 +123,7 @@ class CorrelatedSighting(gtsam.CustomFactor):
 
 
 class SightingStack:
-    """Many `CorrelatedSighting` as arrays (`batch_solution.STACKS`); the same numbers to rounding."""
+    """Many `CorrelatedSighting` as arrays (`batch_solution.StackedGraph`); the same numbers to rounding."""
 
     def __init__(self, factors: Sequence[CorrelatedSighting]) -> None:
         laws = [factor.law for factor in factors]
@@ -184,6 +185,9 @@ class SightingStack:
         e = (self._whitening @ polar_difference(z, self._z)[..., None])[..., 0]
         lengths = np.linalg.norm(e[self._robust], axis=1).tolist()
         return e, lengths, by_pose, by_landmark
+
+
+CorrelatedSighting.Stack = SightingStack
 
 
 def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:

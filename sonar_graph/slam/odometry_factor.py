@@ -23,7 +23,7 @@ ones, so that a solution of thousands evaluates them together (`OdometryStack`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import gtsam
 import numpy as np
@@ -109,6 +109,7 @@ class OdometryWithBias(gtsam.CustomFactor):
     """
 
     __slots__ = ("covariance", "law")
+    Stack: ClassVar[type[OdometryStack]]
 
     def __init__(
         self,
@@ -146,7 +147,7 @@ def to_be_filled(n: int, biases: int) -> OdometryDerivatives:
 
 
 class OdometryStack:
-    """Many `OdometryWithBias`, evaluated together as arrays (`batch_solution.STACKS`); the same numbers to rounding."""
+    """Many `OdometryWithBias`, evaluated as arrays (`batch_solution.StackedGraph`); the same numbers to rounding."""
 
     def __init__(self, factors: Sequence[OdometryWithBias]) -> None:
         laws = [factor.law for factor in factors]
@@ -190,6 +191,9 @@ class OdometryStack:
         # many motions share the biases of a stretch: each is read once
         biases = np.array([values.atVector(key) for key in self._bias_keys])
         return X_i, X_j, biases[self._bias_of] - self._bias_0
+
+
+OdometryWithBias.Stack = OdometryStack
 
 
 # GTSAM calls these for single factors: numba takes longer to return an array, or a named tuple, than to evaluate one

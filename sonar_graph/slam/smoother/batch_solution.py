@@ -20,8 +20,6 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.slam.factors import CorrelatedSighting, SightingStack
-from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
 from sonar_graph.slam.smoother.factor_store import (
     Known,
     Sightlines,
@@ -42,26 +40,19 @@ DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
 
 
-STACKS: dict[type, type[OdometryStack] | type[SightingStack]] = {
-    OdometryWithBias: OdometryStack,
-    CorrelatedSighting: SightingStack,
-}
-"""Factors in Python, and the class that evaluates many of them as arrays."""
-
-
 class StackedGraph:
-    """A graph whose factors in Python are evaluated together (`STACKS`)."""
+    """A graph whose factors in Python are evaluated together, by the `Stack` that their class names."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
         self.factors = [graph.at(i) for i in range(graph.size())]
         self._rest = gtsam.NonlinearFactorGraph()
-        kinds: dict[type, list[Any]] = defaultdict(list)
+        kinds: dict[Any, list[gtsam.NonlinearFactor]] = defaultdict(list)
         for factor in self.factors:
-            if type(factor) in STACKS:
-                kinds[type(factor)].append(factor)
+            if kind := getattr(factor, "Stack", None):
+                kinds[kind].append(factor)
             else:
                 self._rest.add(factor)
-        self._stacks = [STACKS[kind](members) for kind, members in kinds.items()]
+        self._stacks = [kind(members) for kind, members in kinds.items()]
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squared errors."""
