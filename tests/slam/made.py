@@ -84,7 +84,10 @@ def smoother_with(
         waiting_gain=waiting_gain,
     )
     return Smoother(
-        params, BoundedHistory() if is_bounded else WholeHistory(), PoseHistory()
+        params,
+        BoundedHistory() if is_bounded else WholeHistory(),
+        PoseHistory().leave,
+        np.inf,
     )
 
 

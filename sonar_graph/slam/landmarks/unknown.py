@@ -39,9 +39,8 @@ from sonar_graph.models import (
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
-    UNCHANGED,
     Assignment,
-    Decision,
+    Decisions,
     IdentityPolicy,
     LandmarkGraph,
 )
@@ -118,59 +117,47 @@ def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
     ``probability``: chance that a true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of
     freedom.
     """
-    search = _Search(innovations, probability)
-    search.branch(0, search.best)
-    return search.best
+    count = len(innovations.innovation)
+    gates = [0.0] + [
+        chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
+    ]
+    # a pair that is incompatible alone stays so in every pairing; landmarks from near to far
+    possible = [
+        [j for j in np.argsort(row).tolist() if row[j] <= gates[1]]
+        for row in innovations.distances()
+    ]
+    # depth first, detections with the fewest possible landmarks first
+    order = sorted(
+        range(count), key=lambda i: (len(possible[i]) == 0, len(possible[i]))
+    )
+    left = [sum(bool(possible[i]) for i in order[depth:]) for depth in range(count + 1)]
+    """Number of detections at each depth and below that are compatible with a landmark."""
+    best = Pairing((UNPAIRED,) * count, 0.0)
 
-
-class _Search:
-    """Depth first, detections with the fewest possible landmarks first, landmarks from near to far."""
-
-    def __init__(self, innovations: Innovations, probability: float) -> None:
-        count = len(innovations.innovation)
-        self._innovations = innovations
-        self._gates = [0.0] + [
-            chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
-        ]
-        # a pair that is incompatible alone stays so in every pairing
-        self._possible = [
-            [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]]
-            for row in innovations.distances()
-        ]
-        self._order = sorted(
-            range(count),
-            key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])),
-        )
-        self._left = [
-            sum(bool(self._possible[i]) for i in self._order[depth:])
-            for depth in range(count + 1)
-        ]
-        """Number of detections at each depth and below that are compatible with a landmark."""
-        self.best = Pairing((UNPAIRED,) * count, 0.0)
-
-    def branch(self, depth: int, part: Pairing) -> None:
+    def branch(depth: int, part: Pairing) -> None:
         """Try all pairings that extend a part of one."""
-        best = self.best
-        if (part.size, -part.distance) > (
-            best.size,
-            -best.distance,
-        ) and part.distance <= self._gates[part.size]:
-            self.best = part
-        if self._left[depth] == 0:
+        nonlocal best
+        is_better = (part.size, -part.distance) > (best.size, -best.distance)
+        if is_better and part.distance <= gates[part.size]:
+            best = part
+        if left[depth] == 0:
             return
         # bound: D² only grows with pairs, so that a pairing of equal size cannot come below it any more
-        reach = part.size + self._left[depth]
-        if (reach, -part.distance) <= (self.best.size, -self.best.distance):
+        reach = part.size + left[depth]
+        if (reach, -part.distance) <= (best.size, -best.distance):
             return
-        i = self._order[depth]
-        for j in self._possible[i]:
+        i = order[depth]
+        for j in possible[i]:
             if j not in part.landmarks:
-                more = self._innovations.pairing(
+                more = innovations.pairing(
                     (*part.landmarks[:i], j, *part.landmarks[i + 1 :])
                 )
-                if more.distance <= self._gates[reach]:
-                    self.branch(depth + 1, more)
-        self.branch(depth + 1, part)
+                if more.distance <= gates[reach]:
+                    branch(depth + 1, more)
+        branch(depth + 1, part)
+
+    branch(0, best)
+    return best
 
 
 def drop_unlikely(
@@ -278,14 +265,13 @@ Candidate = list[Sighting]
 """Sightings that may be of one landmark, in the order of time."""
 
 
-class PairedDetection(NamedTuple):
-    """Landmark or candidate that a detection was paired with, or neither."""
+class PairedLandmark(NamedTuple):
+    """Landmark that a detection was paired with."""
 
-    landmark_id: int | None = None
-    candidate: Candidate | None = None
-    innovation: Floats | None = None
-    """Innovation against the landmark, shape (2,)."""
-    S: Floats | None = None
+    landmark_id: int
+    innovation: Floats
+    """Shape (2,)."""
+    S: Floats
     """Its covariance, shape (2, 2)."""
 
 
@@ -302,8 +288,6 @@ class NamelessLandmarks(IdentityPolicy):
             min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0
         )
         self._candidates: list[Candidate] = []
-        self._grown: list[Candidate] = []
-        """Candidates that the last frame shows."""
         self._next_id = FIRST_ANONYMOUS_ID
 
     def refuse_taken_ids(self, frame: LandmarkDetections) -> None:
@@ -316,81 +300,59 @@ class NamelessLandmarks(IdentityPolicy):
                 ' below that, or give it identity.unknown.policy = "ignore"'
             )
 
-    def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
-        """Give up sightings that have waited too long."""
-        return Decision.of(self.forget())
-
-    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
-        """Merge the nearest two landmarks that are one."""
+    def revise(self, frame: Frame | None) -> Decisions:  # noqa: ARG002
+        """Give up sightings that have waited too long; then merge the nearest two landmarks that are one."""
+        yield self.forget()
         ids = self.landmarks.ids
         if len(ids) < 2 or ids[-1] < FIRST_ANONYMOUS_ID:
-            return UNCHANGED
+            return
         joint = self.smoother.joint_covariance(
             [self._keyframes.newest_key, *self._keys()]
         )
         duplicates = nearest_duplicates(
             self.landmarks, self.smoother.estimates, joint, self._params
         )
-        if duplicates is None:
-            return UNCHANGED
-        stays, goes = duplicates
-        return Decision.of(
-            Assignment(s, Outcome.MOVED, stays) for s in self.landmarks.sightings(goes)
-        )
+        if duplicates is not None:
+            stays, goes = duplicates
+            merged = self.landmarks.sightings(goes)
+            yield [Assignment(s, Outcome.MOVED, stays) for s in merged]
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
         """All landmarks, and the keyframes of all candidates."""
         return self._keys()
 
-    def judge(self, seen: SeenFrame) -> Decision:
-        """Use paired detections; let the others wait, each with its candidate."""
-        self._grown = []
+    def judge(self, seen: SeenFrame) -> Decisions:
+        """Use paired detections; let the others wait, each with its candidate. Candidates that are placed are landmarks."""
         rows = list(range(len(seen.frame)))
         paired = self.pair(seen.view, seen.frame.z, seen.frame.noise, seen.taken)
         judged = []
-        for sighting, pair in zip(
-            seen.sightings(rows, seen.beam_points(rows)), paired, strict=True
-        ):
-            if pair.landmark_id is not None and pair.S is not None:
+        grown = []
+        for sighting, pair in zip(seen.sightings(rows), paired, strict=True):
+            if isinstance(pair, PairedLandmark):
                 # S = S_0 + R
                 gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0
-                judged.append(
-                    Assignment(
-                        sighting,
-                        Outcome.USED,
-                        pair.landmark_id,
-                        pair.innovation,
-                        pair.S,
-                        gain,
-                    )
-                )
+                judged.append(Assignment(sighting, Outcome.USED, *pair, gain))
                 continue
-            candidate = pair.candidate
-            if candidate is None:  # neither near a landmark nor near what waits
-                candidate = []
-                self._candidates.append(candidate)
-            candidate.append(sighting)
-            self._grown.append(candidate)
+            if pair is None:  # neither near a landmark nor near what waits
+                pair = []
+                self._candidates.append(pair)
+            pair.append(sighting)
+            grown.append(pair)
             judged.append(Assignment(sighting, Outcome.WAITING))
-        return Decision.of(judged)
-
-    def reconsider(self) -> Decision:
-        """Begin a landmark of the next candidate that is placed well enough."""
-        while self._grown:
-            candidate = self._grown.pop(0)
+        yield judged
+        for candidate in grown:
             if self.is_placed(candidate):
                 self._candidates.remove(candidate)
-                landmark_id = self._next_id
-                self._next_id += 1
                 *earlier, newest = candidate
-                later = [
-                    Assignment(sighting, Outcome.PLACED_LATER, landmark_id)
-                    for sighting in earlier
+                placed = [
+                    *(
+                        Assignment(s, Outcome.PLACED_LATER, self._next_id)
+                        for s in earlier
+                    ),
+                    Assignment(newest, Outcome.NEW, self._next_id),
                 ]
-                return Decision.of(
-                    [*later, Assignment(newest, Outcome.NEW, landmark_id)]
-                )
-        return UNCHANGED
+                self._next_id += 1
+                yield placed
 
     def is_placed(self, candidate: Candidate) -> bool:
         """True when a candidate has enough sightings, which place it well enough."""
@@ -425,8 +387,8 @@ class NamelessLandmarks(IdentityPolicy):
 
     def pair(
         self, view: PredictedView, z: Floats, noise: Floats, taken: Set[int]
-    ) -> list[PairedDetection]:
-        """Pair each detection of a frame with a landmark, or else with a candidate.
+    ) -> list[PairedLandmark | Candidate | None]:
+        """Pair each detection of a frame with a landmark, or else with a candidate, or with neither.
 
         Parameters
         ----------
@@ -443,7 +405,7 @@ class NamelessLandmarks(IdentityPolicy):
             source(candidate[-1], values, self.landmarks.factors)
             for candidate in self._candidates
         ]
-        paired = [PairedDetection()] * len(z)
+        paired: list[PairedLandmark | Candidate | None] = [None] * len(z)
         if not keys and not sources:
             return paired
         expected, P = view.expect_jointly(keys, points, sources)
@@ -453,15 +415,12 @@ class NamelessLandmarks(IdentityPolicy):
         innovations = Innovations(e[:, :n], P[: 2 * n, : 2 * n], noise)
         of_landmarks = self._choose(innovations, z)
         for i, j in of_landmarks.items():
-            S = (
-                innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
-                + noise[i]
-            )
-            paired[i] = PairedDetection(ids[j], None, innovations.innovation[i, j], S)
+            of_j = slice(2 * j, 2 * j + 2)
+            paired[i] = PairedLandmark(ids[j], e[i, j], P[of_j, of_j] + noise[i])
         left = [i for i in range(len(z)) if i not in of_landmarks]
         innovations = Innovations(e[left, n:], P[2 * n :, 2 * n :], noise[left])
         for i, j in self._choose(innovations, z[left]).items():
-            paired[left[i]] = PairedDetection(None, self._candidates[j])
+            paired[left[i]] = self._candidates[j]
         return paired
 
     def _choose(self, innovations: Innovations, z: Floats) -> dict[int, int]:
@@ -495,20 +454,14 @@ def nearest_duplicates(
     noise = {i: _noise_m2(landmarks.any_sighting(i)) for i in landmarks.ids}
     d = np.array([points[a] - points[b] for a, b in pairs])  # (k, 3)
     sigma2 = np.array([max(noise[a], noise[b]) for a, b in pairs])
-    # (k, 3)
-    of_a = np.array([covariance.rows[L(a)] for a, _ in pairs])[:, None] + np.arange(3)
-    of_b = np.array([covariance.rows[L(b)] for _, b in pairs])[:, None] + np.arange(3)
-
-    def P(i: NDArray[np.int64], j: NDArray[np.int64]) -> Floats:
-        return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
-
-    S = (
-        P(of_a, of_a)
-        + P(of_b, of_b)
-        - P(of_a, of_b)
-        - P(of_b, of_a)
-        + sigma2[:, None, None] * np.eye(3)
+    of_a, of_b = (
+        np.array([covariance.rows[L(i)] for i in ids])[:, None] + np.arange(3)
+        for ids in zip(*pairs, strict=True)
     )
+    rows = np.concatenate((of_a, of_b), axis=1)  # (k, 6)
+    P = covariance.matrix[rows[:, :, None], rows[:, None, :]]  # (k, 6, 6)
+    apart = np.hstack((np.eye(3), -np.eye(3)))
+    S = apart @ P @ apart.T + sigma2[:, None, None] * np.eye(3)
     # d' S^-1 d
     distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
     for k in np.argsort(distance).tolist():

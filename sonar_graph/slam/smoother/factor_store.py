@@ -249,11 +249,7 @@ class FactorStore:
         self.gone = set()
         self._new_graph = None
 
-    def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
-        """Factors of some groups."""
-        return [factor for handle in handles for factor in self.groups[handle]]
-
-    def graph(self, left_out: Container[int] = ()) -> gtsam.NonlinearFactorGraph:
+    def graph(self, left_out: Container[int | None] = ()) -> gtsam.NonlinearFactorGraph:
         """All factors but those of some handles."""
         return graph_of(
             group for handle, group in self.groups.items() if handle not in left_out
@@ -285,6 +281,6 @@ def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:
     """Graph of the factors of some groups, in their order."""
     graph = gtsam.NonlinearFactorGraph()
     for group in groups:
-        for factor in group.factors.values():
+        for factor in group:
             graph.add(factor)
     return graph

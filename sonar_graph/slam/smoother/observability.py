@@ -18,7 +18,13 @@ import numpy as np
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.factor_store import (
+    BIAS,
+    LANDMARK,
+    POSE,
     FactorStore,
+    is_landmark,
+    is_pose,
+    kind,
     tangent_size,
     variable_name,
 )
@@ -32,14 +38,14 @@ RANK_LIMIT = 1e-9
 OPEN_SHARE = 1e-3
 """Share of a unit vector v from which on a variable takes part in it."""
 AXES = {
-    "x": ("roll", "pitch", "yaw", "forward", "left", "up"),
-    "l": ("x", "y", "z"),
-    "b": ("about x", "about y", "about z"),
+    POSE: ("roll", "pitch", "yaw", "forward", "left", "up"),
+    LANDMARK: ("x", "y", "z"),
+    BIAS: ("about x", "about y", "about z"),
 }
 MISSING = {
-    "l": "an elevation, a floor prior or a view from elsewhere is missing",
-    "b": "a prior or a walk from another bias is missing",
-    "x": "odometry from another keyframe or a prior is missing",
+    LANDMARK: "an elevation, a floor prior or a view from elsewhere is missing",
+    BIAS: "a prior or a walk from another bias is missing",
+    POSE: "odometry from another keyframe or a prior is missing",
 }
 SPOILT = "gives an error that is no number"
 
@@ -54,7 +60,7 @@ class Open:
 
     def axes(self) -> str:
         """Name of the axis nearest to each direction, with its components where it is not the axis itself."""
-        names, found = AXES[chr(gtsam.symbolChr(self.key))], []
+        names, found = AXES[kind(self.key)], []
         for direction in self.directions:
             nearest = int(np.argmax(np.abs(direction)))
             shares = f"mostly {names[nearest]} ({', '.join(f'{share:.2f}' for share in direction)})"
@@ -184,7 +190,7 @@ class Blame:
         return [
             self._without(open_)
             for key in self._new_keys
-            if gtsam.symbolChr(key) != ord("x")
+            if not is_pose(key)
             for open_ in left_open(self.graph, values, [key], least_said)
         ]
 
@@ -205,10 +211,7 @@ class Blame:
                 graph.add(factor)
         found: list[Withheld] = []
         for open_ in left_open(graph, values, sorted(inside)):
-            if (
-                gtsam.symbolChr(open_.key) == ord("x")
-                or open_.key not in self._new_keys
-            ):
+            if is_pose(open_.key) or open_.key not in self._new_keys:
                 raise EstimatorError(
                     f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}"
                 )
@@ -262,7 +265,7 @@ class Blame:
 
     def _explained(self, open_: Open, factors: list[Labelled]) -> str:
         """Variable, its factors, the open directions, and what would close them, in words."""
-        missing = MISSING[chr(gtsam.symbolChr(open_.key))]
+        missing = MISSING[kind(open_.key)]
         return f"{self._told(factors, open_.key)}; open: {open_.axes()}; {missing}"
 
     def _told(self, factors: list[Labelled], key: int | None = None) -> str:
@@ -272,26 +275,15 @@ class Blame:
         """
         keys = [list(factor.keys()) for _, factor in factors]
         if key is None:
-            key = max(keys[0], key=lambda k: gtsam.symbolChr(k) == ord("l"))
-        is_pose = gtsam.symbolChr(key) == ord("x")
-        keyframes = (
-            [key]
-            if is_pose
-            else sorted(
-                {k for ks in keys for k in ks if gtsam.symbolChr(k) == ord("x")}
-            )
-        )
+            key = max(keys[0], key=is_landmark)
+        keyframes = sorted({k for ks in keys for k in ks if is_pose(k)})
         at = ", ".join(
             f"{variable_name(k)} at {self._times_s[k]:.3f} s"
-            for k in keyframes
+            for k in ([key] if is_pose(key) else keyframes)
             if k in self._times_s
         )
-        name = (
-            at
-            if is_pose and at
-            else f"{variable_name(key)}, from {at}"
-            if at
-            else variable_name(key)
-        )
+        name = variable_name(key)
+        if at:
+            name = at if is_pose(key) else f"{name}, from {at}"
         counts = Counter(label for label, _ in factors)
         return f"{name}: {', '.join(f'{count} {label}' for label, count in counts.items()) or 'no factor'}"
