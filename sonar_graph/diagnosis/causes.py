@@ -5,6 +5,7 @@ whole log. It is named where q is sure, e is clearly smaller than ``y - x - a``,
 docs/theory/sensor_check.md.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,6 +45,7 @@ LEAST_DRIFT_M_S = 0.03
 LEAST_PITCH_RAD = np.radians(3.0)
 LEAST_SONAR_TURN_RAD = np.radians(5.0)
 LEAST_DEVIATION_RAD = np.radians(3.0)
+LARGEST_DEVIATION_RAD = np.radians(45.0)
 LEAST_CURRENT_M_S = 0.05
 BEST_NOISE_M_S = 0.01
 """Of a row of a good Doppler log."""
@@ -67,6 +69,8 @@ class Cause:
     """Length of q from which on the cause matters."""
     advice: Callable[[Values, Calibration], Advice]
     """By q."""
+    largest: float = math.inf
+    """Length of q beyond which something else is wrong."""
 
 
 def since_middle(stretch: SignalStretch) -> Values:
@@ -225,6 +229,7 @@ DEVIATION = Cause(
     # its owner knows of a bias, which may change with the heading
     least=lambda known: max(LEAST_DEVIATION_RAD, 2.0 * known.heading.bias_sigma_rad),
     advice=deviation_advice,
+    largest=LARGEST_DEVIATION_RAD,
 )
 # iron that the Earth magnetises beside magnets on the vehicle
 SOFT_IRON = replace(DEVIATION, columns=of_turn_and_twice, wanted=4)
@@ -262,7 +267,8 @@ def cause_of(
     if not fits:
         return None
     result, cause = min(fits, key=lambda fit: fit[0].after)
-    if result.after > most * found.scatter:
+    is_too_large = float(np.linalg.norm(result.q)) > cause.largest
+    if is_too_large or result.after > most * found.scatter:
         return None
     for rival, other in fits:
         is_small = float(np.linalg.norm(rival.q)) < other.least(calibration)

@@ -15,6 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Start
+from sonar_graph.devices import is_partial
 from sonar_graph.diagnosis.aiding_check import (
     AZIMUTH,
     CHECKS,
@@ -180,8 +181,16 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     """
     # matrices are small: threads of BLAS would only wait for each other
     with threadpool_limits(1, user_api="blas"):
-        findings = all_findings(sequence, config or LogConfig())
+        findings = all_findings(of_whole_velocities(sequence), config or LogConfig())
     return worst_first([*unplaced_findings(sequence, findings), *findings])
+
+
+def of_whole_velocities(sequence: Sequence) -> Sequence:
+    """The sequence without the rows of the Doppler log that estimators refuse: some beams measured nothing."""
+    is_partial_row = is_partial(sequence.dvl.velocity_cov)
+    if not is_partial_row.any() or is_partial_row.all():
+        return sequence
+    return replace(sequence, dvl=sequence.dvl.rows(np.flatnonzero(~is_partial_row)))
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
