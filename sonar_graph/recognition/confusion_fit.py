@@ -98,7 +98,7 @@ class Accuracy(NamedTuple):
 
     def sigmas_m(self, bound_m: Floats) -> Floats:
         """Standard deviations at bounds, shape (..., 2)."""
-        return np.asarray(self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power)
+        return self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power
 
 
 class TrueObjects(NamedTuple):
@@ -444,9 +444,7 @@ def accuracy(
     tiny = np.finfo(float).tiny
 
     def variances(power: float) -> Floats:
-        return np.asarray(
-            np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once)
-        )
+        return np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once)
 
     def loss(power: float) -> float:
         # negative log posterior of the power; the sigmas are profiled out

@@ -211,11 +211,11 @@ class LabelledTrack:
 
     def off(self) -> Floats:
         """Mean place of the labels from `middle`, shape (3,)."""
-        return np.asarray(np.mean(self.labelled, axis=0) - self.middle())
+        return np.mean(self.labelled, axis=0) - self.middle()
 
     def middle(self) -> Floats:
         """Median place of the sightings, shape (3,)."""
-        return np.asarray(np.median(self.seen, axis=0))
+        return np.median(self.seen, axis=0)
 
 
 @dataclass(frozen=True)
@@ -432,7 +432,7 @@ def place_of(range_m: float, azimuth_rad: float, session: RecognitionSession) ->
     for floor in (session.view, SLANT_PLANE):
         if floor is not None and np.isnan(q).any():
             q = floor.floor_points(np.array([range_m]), np.array([azimuth_rad]))[0]
-    return np.asarray(session.start_T_sonar.transformFrom(q))
+    return session.start_T_sonar.transformFrom(q)
 
 
 def _seen_from(world_T_sonar: gtsam.Pose3, place: Floats, landmark: int) -> TrueObjects:

@@ -244,7 +244,7 @@ class Figures(NamedTuple):
         """Whether places about the middle of a template lie on the uncovered side of an edge."""
         direction, offset = divmod(edge, len(OFFSETS))
         reach_m = OFFSETS[offset] * self.radius_m[template]
-        return np.asarray(along_edge(x_m, y_m, direction) <= reach_m)
+        return along_edge(x_m, y_m, direction) <= reach_m
 
 
 class _Grid(NamedTuple):
@@ -335,7 +335,7 @@ def _zones(figure: Floats32, dark: Floats32, is_compared: Bools) -> Ints:
     back = BEHIND * (is_out & is_behind)
     # a plate belongs to the design, so its cells are no floor
     far = FAR * (is_out & ~is_near & (dark < OUT))
-    return np.asarray(near + back + far)
+    return near + back + far
 
 
 def _counts(independent: float) -> Floats:
@@ -444,9 +444,7 @@ def fill_evidence(
         # cut by the rim of the image: sums over all cells are too large
         if view.cells < len(cells):
             kept = kept_sums(values, view.is_seen, uncovered)
-        covered, best_edge = least_covered(
-            view, values, uncovered, kept, products, fit
-        )
+        covered, best_edge = least_covered(view, values, uncovered, kept, products, fit)
         # a figure darker than the floor is no figure of foam
         whole = fit.design if fit.beta > 0 else fit.without_figure
         cells_count = 0.5 * view.cells * figures.counts[COVERED]
@@ -680,7 +678,7 @@ def least_covered(
 def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
     """How far places lie in one of `EDGES` directions."""
     towards_rad = 2 * math.pi * direction / EDGES
-    return np.asarray(x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad))
+    return x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
 
 
 @compiled

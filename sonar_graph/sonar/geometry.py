@@ -131,10 +131,9 @@ class FloorView:
         along = points_m @ up
         horizontal2 = np.maximum(np.sum(points_m**2, axis=1) - along**2, 0.0)
         slope = np.abs(_elevation_derivatives(points_m) @ up)
-        return np.asarray(
-            np.sqrt(self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2)
-            / np.maximum(slope, 1e-9)
-        )
+        return np.sqrt(
+            self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2
+        ) / np.maximum(slope, 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +280,7 @@ def point_covariances(
     spherical = np.zeros((len(r), 3, 3))
     spherical[:, :2, :2] = range_azimuth_cov
     spherical[:, 2, 2] = elevation_sigmas_rad**2
-    return np.asarray(jacobian @ spherical @ jacobian.transpose(0, 2, 1))
+    return jacobian @ spherical @ jacobian.transpose(0, 2, 1)
 
 
 def _elevation_derivatives(points_m: Floats) -> Floats:

@@ -290,7 +290,7 @@ class Tracker:
         unexplained = (params.new_per_frame + params.clutter_per_frame) / area
         weights = densities * (before.existence * detection)
         weights = np.hstack([weights, np.full((len(weights), 1), unexplained)])
-        matrix = np.asarray(weights / weights.sum(axis=1, keepdims=True))
+        matrix = weights / weights.sum(axis=1, keepdims=True)
         took = most_probable_assignment(matrix)
 
         # existence by Bayes: p(frame | exists) over p(frame | does not), with clutter in the denominator
