@@ -183,20 +183,21 @@ class LabelledSightings:
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
-        rows = self._rows
-        tracks = np.reshape([row.track for row in rows], (-1, 2))
-        _, track = np.unique(tracks, axis=0, return_inverse=True)
-        evidence = np.array([row.evidence for row in rows], float)
+
+        def column(name: str, *shape: int) -> Floats:
+            return np.reshape([getattr(row, name) for row in self._rows], (-1, *shape))
+
+        _, track = np.unique(column("track", 2), axis=0, return_inverse=True)
         return LabelledFits(
-            evidence=evidence.reshape(-1, len(self.ids), len(EVIDENCE)),
-            bound_m=np.array([row.bound_m for row in rows], float).reshape(-1, 2),
-            moved_m=np.array([row.moved_m for row in rows], float).reshape(-1, 2),
-            label=np.array([row.label for row in rows], np.int64),
+            evidence=column("evidence", len(self.ids), len(EVIDENCE)),
+            bound_m=column("bound_m", 2),
+            moved_m=column("moved_m", 2),
+            label=column("label").astype(np.int64),
             track=track.ravel(),
-            independent_share=np.array([row.independent_share for row in rows], float),
-            error_m=np.array([row.error_m for row in rows], float).reshape(-1, 2),
-            range_per_height=np.array([row.range_per_height for row in rows], float),
-            stamp_ns=np.array([row.stamp_ns for row in rows], np.int64),
+            independent_share=column("independent_share"),
+            error_m=column("error_m", 2),
+            range_per_height=column("range_per_height"),
+            stamp_ns=column("stamp_ns").astype(np.int64),
         )
 
 

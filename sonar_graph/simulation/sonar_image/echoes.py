@@ -15,7 +15,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
-from sonar_graph.simulation.sonar_image.scene import Floats32
+from sonar_graph.simulation.sonar_image.scene import Floats32, Scatterers
 
 TAPS = 6
 """Bins that one echo reaches."""
@@ -65,13 +65,6 @@ class SonarPlacement(NamedTuple):
     """First and last column (not included) of each row, shape (rows, 2)."""
     shift: Ints
     """Added to row and column of the amplitudes: (0, 0) where speckle belongs to the world."""
-
-
-class Floor(NamedTuple):
-    """Scatterers of the bare floor, as `Scatterers` has them."""
-
-    points: Floats32
-    texture: Floats32
 
 
 class Surface(NamedTuple):
@@ -218,7 +211,7 @@ def table_places(
 @compiled
 def sum_echoes(
     view: SonarPlacement,
-    floor: Floor,
+    floor: Scatterers,
     surface: Surface,
     horizon: Horizon,
     tables: Tables,
@@ -322,12 +315,8 @@ def through_beams(
                 )
 
 
-def no_surface() -> Surface:
-    """Surface without objects."""
-    none = np.empty((0, 0), np.float32)
-    return Surface(0, none, none)
-
-
-def no_horizon() -> Horizon:
-    """Horizon without shadows."""
-    return Horizon(np.empty((0, 0), np.float32), 1.0, 1.0)
+NONE = np.empty((0, 0), np.float32)
+NO_SURFACE = Surface(0, NONE, NONE)
+"""Without objects."""
+NO_HORIZON = Horizon(NONE, 1.0, 1.0)
+"""Without shadows."""
