@@ -335,6 +335,16 @@ def estimate_confusion(
     counted = np.where(is_left_out[:, None], np.nan, error)
     found = accuracy(counted, fits.bound_m, fits.track, Accuracy.of(shipped))
     sigmas_m = np.hypot(found.sigmas_m(fits.bound_m), fits.moved_m)
+    range_sigma_m, across_sigma_m = found.usual_sigmas_m.tolist()
+    range_bound_m, across_bound_m = found.usual_m.tolist()
+    said = dict(provenance)
+    if poor:
+        said["confusion matrix"] = (
+            f"too few frames, so as without calibration: {', '.join(poor)}"
+        )
+    for kind, numbers in (("frames", counts), ("tracks", tracks_of(fits))):
+        for name, number in zip(names, numbers.tolist(), strict=True):
+            said[f"{kind} of {name}"] = str(number)
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
@@ -342,32 +352,17 @@ def estimate_confusion(
         weights=tuple(weights.tolist()),
         looks=looks,
         doubt=shipped.doubt,
-        range_sigma_m=float(found.usual_sigmas_m[0]),
-        across_sigma_m=float(found.usual_sigmas_m[1]),
-        range_bound_m=float(found.usual_m[0]),
-        across_bound_m=float(found.usual_m[1]),
+        range_sigma_m=range_sigma_m,
+        across_sigma_m=across_sigma_m,
+        range_bound_m=range_bound_m,
+        across_bound_m=across_bound_m,
         bound_power=found.power,
         height_bias_m=height_bias_m,
         roughness=roughness_of_tracks(fits, shipped.roughness),
         report_interval_s=report_interval_s(
             error / sigmas_m, fits.track, fits.stamp_ns, shipped.report_interval_s
         ),
-        provenance=provenance
-        | (
-            {
-                "confusion matrix": f"too few frames, so as without calibration: {', '.join(poor)}"
-            }
-            if poor
-            else {}
-        )
-        | {
-            f"frames of {n}": str(c)
-            for n, c in zip(names, counts.tolist(), strict=True)
-        }
-        | {
-            f"tracks of {n}": str(c)
-            for n, c in zip(names, tracks_of(fits).tolist(), strict=True)
-        },
+        provenance=said,
     )
 
 

@@ -181,10 +181,9 @@ class Recognition:
 
     def entry(self) -> dict[str, Any]:
         """Content for JSON, without detections and pictures."""
-        outcomes = dict(self.outcomes.most_common())
         return {
             "frames": self.frames,
-            "outcomes": outcomes,
+            "outcomes": dict(self.outcomes.most_common()),
             "warnings": self.warnings,
             "notes": self.notes,
         }

@@ -35,7 +35,7 @@ from sonar_graph.sonar.templates import (
     Patch,
     Templates,
     drawn,
-    material_radius_m,
+    places_around,
 )
 
 Bools = NDArray[np.bool_]
@@ -263,11 +263,7 @@ class _Grid(NamedTuple):
 
     @classmethod
     def of(cls, designs: Sequence[LandmarkDesign], cell_m: float) -> _Grid:
-        material_m = max(map(material_radius_m, designs))
-        half = math.ceil((material_m + SHADOW_M) / cell_m)
-        places_m = cell_m * np.arange(-half, half + 1)
-        x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
-        away_m = np.hypot(x_m, y_m)
+        x_m, y_m, away_m, material_m = places_around(designs, SHADOW_M, cell_m)
         is_around = away_m <= material_m + REACH_M
         # within 60 degrees of the direction away from the sonar, where a shadow falls
         is_behind = (away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m)

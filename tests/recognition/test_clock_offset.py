@@ -50,19 +50,17 @@ def estimated(
     return estimate_offset(moved(steps, offset_s), lane.sequence, RANGE_M, **search)
 
 
-@pytest.mark.parametrize("offset_s", [1.37, -4.2])
-def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s):
-    found = estimated(lane, steps, offset_s)
+@pytest.mark.parametrize(
+    ("offset_s", "search"),
+    [(1.37, {}), (-4.2, {}), (50.3, {"around_s": 50.0, "search_s": 2.0})],
+)
+def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s, search):
+    found = estimated(lane, steps, offset_s, **search)
     assert abs(found.seconds - offset_s) < 3 * found.sigma_s + 0.01
     assert found.sigma_s < 0.1
     assert re.match(
-        r"[+-]\d\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found)
+        r"[+-]\d+\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found)
     )
-
-
-def test_an_offset_is_searched_about_what_was_stated(lane, steps):
-    found = estimated(lane, steps, 50.3, around_s=50.0, search_s=2.0)
-    assert abs(found.seconds - 50.3) < 3 * found.sigma_s + 0.01
 
 
 def test_steps_that_err_wildly_are_left_out(lane, steps):

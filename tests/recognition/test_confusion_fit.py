@@ -4,6 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
@@ -43,6 +46,20 @@ def test_a_sighting_is_of_what_truly_lies_there():
         seen = ObjectSighting(None, *place, np.eye(2))
         assert there.label_of(seen)[0] == label, place
         assert behind.label_of(seen)[0] == confusion_fit.NONE, place
+
+
+@given(st.integers(0, 27))
+def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
+    stamp_ns = int(lane.sequence.truth.stamps_ns[50 * second])
+    _, range_m, azimuth_rad = confusion_fit.true_objects(lane.sequence, stamp_ns)
+    motion = lane.path.at(np.array([float(second)]))
+    mounting = lane.sequence.calibration.sonar.mounting
+    body_R_sonar = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
+    for row, landmark in enumerate(lane.sequence.true_landmarks.positions):
+        in_body = motion.world_R_body[0].inv().apply(landmark - motion.position[0])
+        q = body_R_sonar.inv().apply(in_body - np.array(mounting.translation_m))
+        assert range_m[row] == pytest.approx(np.linalg.norm(q), abs=1e-6)
+        assert azimuth_rad[row] == pytest.approx(np.arctan2(q[1], q[0]), abs=1e-6)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -81,7 +81,10 @@ def test_a_fixed_sonar_does_not_move_whatever_its_images_show(lane):
 def test_landmarks_are_recognised_by_images_alone(lane, lane_recognition):
     calibration = lane.sequence.calibration
     alone = ImagesAlone("lane", calibration, int(lane.frames.stamps_ns[0]), {})
-    found = recognise_images(one_by_one(lane.frames), alone)
+    counts = []
+    frames = one_by_one(lane.frames)
+    found = recognise_images(frames, alone, progress=counts.append)
+    assert counts == list(range(1, len(lane.frames) + 1))
     named, probability = found.detections.most_probable()
     assert set(named[probability > SURE].tolist()) == {1, 2, 3, 4}
     expected = lane_recognition.detections

@@ -142,6 +142,31 @@ def test_other_designs_and_blocks_of_more_frames_are_refused():
         )
 
 
+def test_linear_samples_give_nearly_the_same():
+    image_of = SonarImage(scale="linear", full_scale=1e8)
+    scale = Calibration(sonar=SonarCalibration(image=image_of))
+    plain, linear = (Recogniser(of, params=EVERY) for of in (DECIBELS, scale))
+    for k in range(4):
+        image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
+        expected = look(plain, k, image, 0.0).detections
+        samples = (1e3 * 10 ** (image / 20)).astype(np.float32)
+        found = look(linear, k, samples, 0.0).detections
+    np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
+    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=0.01)
+
+
+def test_the_motion_over_a_bad_frame_counts_once():
+    good, bad = (Recogniser(DECIBELS, params=EVERY) for _ in range(2))
+    for recogniser in (good, bad):
+        pass_by(recogniser, 5)
+    assert not look(bad, 5, np.zeros((96, 512), np.float32), 0.35).is_used
+    last = picture(SQUARE, 1.7, -0.15, 0.4, 6)
+    expected = look(good, 6, last, 0.05).detections
+    found = look(bad, 6, last, -0.3).detections
+    assert found.track.tolist() == expected.track.tolist()
+    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
+
+
 def test_a_sonar_that_comes_to_rest_keeps_its_belief():
     """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
     recogniser = Recogniser(DECIBELS, params=EVERY)
