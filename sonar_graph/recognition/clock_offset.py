@@ -105,7 +105,7 @@ class NavigationMotion:
             self._sums[before + 1] - self._sums[before]
         )
         sums[(place < 0) | (place > len(self._sums) - 1)] = np.nan
-        return np.asarray(sums)
+        return sums
 
 
 def estimate_offset(
@@ -227,7 +227,7 @@ def _profile(
                 * n
                 * np.log1p(-(min(_correlation(z[:, c], fitted[:, c]), 0.99999) ** 2))
             )
-    return np.asarray(profile)
+    return profile
 
 
 def _top(offsets_s: Floats, profile: Floats) -> float:

@@ -98,7 +98,7 @@ class Accuracy(NamedTuple):
 
     def sigmas_m(self, bound_m: Floats) -> Floats:
         """Standard deviations at bounds, shape (..., 2)."""
-        return np.asarray(self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power)
+        return self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power
 
 
 class TrueObjects(NamedTuple):
@@ -183,20 +183,21 @@ class LabelledSightings:
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
-        rows = self._rows
-        tracks = np.reshape([row.track for row in rows], (-1, 2))
-        _, track = np.unique(tracks, axis=0, return_inverse=True)
-        evidence = np.array([row.evidence for row in rows], float)
+
+        def column(name: str, *shape: int) -> Floats:
+            return np.reshape([getattr(row, name) for row in self._rows], (-1, *shape))
+
+        _, track = np.unique(column("track", 2), axis=0, return_inverse=True)
         return LabelledFits(
-            evidence=evidence.reshape(-1, len(self.ids), len(EVIDENCE)),
-            bound_m=np.array([row.bound_m for row in rows], float).reshape(-1, 2),
-            moved_m=np.array([row.moved_m for row in rows], float).reshape(-1, 2),
-            label=np.array([row.label for row in rows], np.int64),
+            evidence=column("evidence", len(self.ids), len(EVIDENCE)),
+            bound_m=column("bound_m", 2),
+            moved_m=column("moved_m", 2),
+            label=column("label").astype(np.int64),
             track=track.ravel(),
-            independent_share=np.array([row.independent_share for row in rows], float),
-            error_m=np.array([row.error_m for row in rows], float).reshape(-1, 2),
-            range_per_height=np.array([row.range_per_height for row in rows], float),
-            stamp_ns=np.array([row.stamp_ns for row in rows], np.int64),
+            independent_share=column("independent_share"),
+            error_m=column("error_m", 2),
+            range_per_height=column("range_per_height"),
+            stamp_ns=column("stamp_ns").astype(np.int64),
         )
 
 
@@ -334,6 +335,16 @@ def estimate_confusion(
     counted = np.where(is_left_out[:, None], np.nan, error)
     found = accuracy(counted, fits.bound_m, fits.track, Accuracy.of(shipped))
     sigmas_m = np.hypot(found.sigmas_m(fits.bound_m), fits.moved_m)
+    range_sigma_m, across_sigma_m = found.usual_sigmas_m.tolist()
+    range_bound_m, across_bound_m = found.usual_m.tolist()
+    said = dict(provenance)
+    if poor:
+        said["confusion matrix"] = (
+            f"too few frames, so as without calibration: {', '.join(poor)}"
+        )
+    for kind, numbers in (("frames", counts), ("tracks", tracks_of(fits))):
+        for name, number in zip(names, numbers.tolist(), strict=True):
+            said[f"{kind} of {name}"] = str(number)
     return Confusion(
         ids=ids,
         designs=tuple(map(mark_of, designs)),
@@ -341,32 +352,17 @@ def estimate_confusion(
         weights=tuple(weights.tolist()),
         looks=looks,
         doubt=shipped.doubt,
-        range_sigma_m=float(found.usual_sigmas_m[0]),
-        across_sigma_m=float(found.usual_sigmas_m[1]),
-        range_bound_m=float(found.usual_m[0]),
-        across_bound_m=float(found.usual_m[1]),
+        range_sigma_m=range_sigma_m,
+        across_sigma_m=across_sigma_m,
+        range_bound_m=range_bound_m,
+        across_bound_m=across_bound_m,
         bound_power=found.power,
         height_bias_m=height_bias_m,
         roughness=roughness_of_tracks(fits, shipped.roughness),
         report_interval_s=report_interval_s(
             error / sigmas_m, fits.track, fits.stamp_ns, shipped.report_interval_s
         ),
-        provenance=provenance
-        | (
-            {
-                "confusion matrix": f"too few frames, so as without calibration: {', '.join(poor)}"
-            }
-            if poor
-            else {}
-        )
-        | {
-            f"frames of {n}": str(c)
-            for n, c in zip(names, counts.tolist(), strict=True)
-        }
-        | {
-            f"tracks of {n}": str(c)
-            for n, c in zip(names, tracks_of(fits).tolist(), strict=True)
-        },
+        provenance=said,
     )
 
 
@@ -444,9 +440,7 @@ def accuracy(
     tiny = np.finfo(float).tiny
 
     def variances(power: float) -> Floats:
-        return np.asarray(
-            np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once)
-        )
+        return np.average(error**2 * np.exp(-2 * power * growth), axis=0, weights=once)
 
     def loss(power: float) -> float:
         # negative log posterior of the power; the sigmas are profiled out

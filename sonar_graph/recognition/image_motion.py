@@ -13,6 +13,7 @@ Roll, pitch and motion up and down are taken to be small; they are given the sta
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -24,7 +25,13 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, Floats
-from sonar_graph.sonar import SLANT_PLANE, FloorView, SonarStep, with_lens
+from sonar_graph.sonar import (
+    SLANT_PLANE,
+    FloorView,
+    MadeOfWindow,
+    SonarStep,
+    with_lens,
+)
 
 MotionFrom = Literal["navigation", "images", "fixed"]
 PIXELS_AHEAD = 128
@@ -237,8 +244,9 @@ class ImageMotions:
             # a start below the floor states no height
             if world_T_sonar.z() > calibration.floor.z_m:
                 self.view = FloorView.from_pose(world_T_sonar, calibration.floor.z_m)
-        self._floor: tuple[SonarFrames, FloorPicture] | None = None
-        self._before: tuple[int, Picture] | None = None
+        view = self.view or SLANT_PLANE
+        self._rasters = MadeOfWindow(partial(FloorPicture, view=view))
+        self._before: tuple[int, FloorPicture, Picture] | None = None
         self._last = np.zeros(3)
         """Rates of the step before."""
         self.step: PlanarStep | None = None
@@ -263,29 +271,22 @@ class ImageMotions:
         if self._is_fixed:
             return None
         frame = with_lens(frame, self._calibration.sonar.lens)
-        # another window has another raster, and no picture before
-        if self._floor is None or not is_alike(self._floor[0], frame):
-            view = self.view or SLANT_PLANE
-            self._floor = (
-                frame,
-                FloorPicture(frame.ranges_m, frame.azimuths_rad, view),
-            )
-            self._before = None
-        raster = self._floor[1]
+        raster = self._rasters.of(frame)
         picture = raster.of(
             decibels(
                 np.ascontiguousarray(frame.intensity[0]), self._calibration.sonar.image
             )
         )
         before = self._before
-        self._before = (stamp_ns, picture)
-        if before is None or stamp_ns <= before[0]:
+        self._before = (stamp_ns, raster, picture)
+        # a picture of another window lies on another raster
+        if before is None or before[1] is not raster or stamp_ns <= before[0]:
             return None
         seconds = (stamp_ns - before[0]) * 1e-9
         found = None
         if stamp_ns - before[0] <= LONGEST_STEP_NS:
             # vehicles are slow to change their velocity: begin at the motion of the step before
-            found = raster.motion(before[1], picture, self._last * seconds)
+            found = raster.motion(before[2], picture, self._last * seconds)
         fastest = seconds * np.array([FASTEST_RAD_S, FASTEST_M_S, FASTEST_M_S])
         is_measured = found is not None and bool((np.abs(found[0]) <= fastest).all())
         if found is not None and is_measured:
@@ -335,9 +336,3 @@ class ImageMotions:
         return {
             "detections.motion": f"from the images: {self.measured} of {self.steps} steps measured"
         }
-
-
-def is_alike(one: SonarFrames, other: SonarFrames) -> bool:
-    """True for frames with the same beams and bins."""
-    pairs = (one.ranges_m, other.ranges_m), (one.azimuths_rad, other.azimuths_rad)
-    return all(a is b or np.array_equal(a, b) for a, b in pairs)

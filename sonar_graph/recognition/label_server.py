@@ -20,9 +20,9 @@ import numpy as np
 from sonar_graph.calibration import SonarCalibration
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.recognition.labels import Label, Labels, is_of_one_object
-from sonar_graph.recognition.recognition_record import FrameFans, as_jpeg, draw_fan
+from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
 from sonar_graph.recognition.session import one_by_one
-from sonar_graph.sonar import Fan, with_lens
+from sonar_graph.sonar import Fan, MadeOfWindow, with_lens
 
 HOST = "127.0.0.1"
 PIXELS_HIGH = 640
@@ -62,14 +62,14 @@ def shown_frames(
 ) -> list[ShownFrame]:
     """Pictures of frames, at least a period apart and at most `MOST_FRAMES`, evenly over the log."""
     shown: list[ShownFrame] = []
-    fans = FrameFans()
+    fans = MadeOfWindow(partial(Fan.of, pixels_high=PIXELS_HIGH))
     for frame in (
         frame for block in blocks for frame in one_by_one(with_lens(block, sonar.lens))
     ):
         stamp_ns = int(frame.stamps_ns[0])
         if shown and stamp_ns - shown[-1].stamp_ns < period_ns:
             continue
-        fan = fans.of(frame, PIXELS_HIGH)
+        fan = fans.of(frame)
         picture = draw_fan(decibels(frame.intensity[0], sonar.image), fan, None)
         shown.append(ShownFrame(stamp_ns, as_jpeg(picture), fan))
         # too many: leave out every second, and look half as often from here on
@@ -171,7 +171,7 @@ class LabelServer(ThreadingHTTPServer):
     ) -> None:
         self.desk = desk
         self.ids = frozenset(ids)
-        self._page = page
+        self.page = page
         # other users of the computer do not know it
         self.word = secrets.token_urlsafe(16)
         super().__init__((HOST, port), _LabelRequest)
@@ -188,10 +188,6 @@ class LabelServer(ThreadingHTTPServer):
 
     def handle_error(self, *_: Any) -> None:
         """A browser that goes away in the middle of a request is no error."""
-
-    def page(self, nonce: str) -> str:
-        """The page, whose script has this nonce."""
-        return self._page(nonce)
 
 
 class _LabelRequest(BaseHTTPRequestHandler):

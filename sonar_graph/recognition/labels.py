@@ -167,55 +167,39 @@ class LabelledTrack:
     """Frames with a sighting: stamp, pose of the sonar, the track in it."""
     seen: list[Floats] = field(default_factory=list)
     """Places of the sightings."""
-    labels: list[tuple[int, Label]] = field(default_factory=list)
-    """Each after its row (from 1)."""
-    labelled: list[Floats] = field(default_factory=list)
-    """Places of the labels."""
+    labels: list[tuple[int, Label, Floats]] = field(default_factory=list)
+    """Each after its row (from 1), and its place."""
 
     @property
     def ids(self) -> set[int | None]:
         """Identities of the labels."""
-        return {label.id for _, label in self.labels}
+        return {label.id for _, label, _ in self.labels}
+
+    @property
+    def labelled(self) -> list[Floats]:
+        """Places of the labels."""
+        return [place for _, _, place in self.labels]
 
     def drop_contradictions(self) -> list[int]:
         """Leave out several identities in one frame, and those of fewer than half of the rest; their rows."""
         said_at: dict[int, set[int | None]] = defaultdict(set)
-        for _, label in self.labels:
+        for _, label, _ in self.labels:
             said_at[label.stamp_ns].add(label.id)
         # two identities of one object in one frame: neither counts
-        sound = [
-            label.id for _, label in self.labels if len(said_at[label.stamp_ns]) == 1
-        ]
+        sound = [one for one in self.labels if len(said_at[one[1].stamp_ns]) == 1]
+        counts = Counter(label.id for _, label, _ in sound)
         # the identity of more than half of the labels, if there is one
-        most = [
-            landmark
-            for landmark, count in Counter(sound).items()
-            if 2 * count > len(sound)
-        ]
-        kept = [
-            label.id in most and len(said_at[label.stamp_ns]) == 1
-            for _, label in self.labels
-        ]
-        dropped = [
-            row
-            for (row, _), is_kept in zip(self.labels, kept, strict=True)
-            if not is_kept
-        ]
-        self.labelled = [
-            place for place, is_kept in zip(self.labelled, kept, strict=True) if is_kept
-        ]
-        self.labels = [
-            label for label, is_kept in zip(self.labels, kept, strict=True) if is_kept
-        ]
-        return dropped
+        rows = {row for row, _, _ in self.labels}
+        self.labels = [one for one in sound if 2 * counts[one[1].id] > len(sound)]
+        return sorted(rows.difference(row for row, _, _ in self.labels))
 
     def off(self) -> Floats:
         """Mean place of the labels from `middle`, shape (3,)."""
-        return np.asarray(np.mean(self.labelled, axis=0) - self.middle())
+        return np.mean(self.labelled, axis=0) - self.middle()
 
     def middle(self) -> Floats:
         """Median place of the sightings, shape (3,)."""
-        return np.asarray(np.median(self.seen, axis=0))
+        return np.median(self.seen, axis=0)
 
 
 @dataclass(frozen=True)
@@ -369,10 +353,8 @@ def _labelled_tracks(
             }
             nearest = min(away, key=lambda number: away[number], default=None)
             if nearest is not None and away[nearest] <= NEAR_M:
-                tracks[nearest].labels.append((row, label))
-                tracks[nearest].labelled.append(
-                    place_of(label.range_m, label.azimuth_rad, session)
-                )
+                place = place_of(label.range_m, label.azimuth_rad, session)
+                tracks[nearest].labels.append((row, label, place))
             else:
                 # a label outside of the image may be in degrees
                 in_radians = label.model_copy(
@@ -432,7 +414,7 @@ def place_of(range_m: float, azimuth_rad: float, session: RecognitionSession) ->
     for floor in (session.view, SLANT_PLANE):
         if floor is not None and np.isnan(q).any():
             q = floor.floor_points(np.array([range_m]), np.array([azimuth_rad]))[0]
-    return np.asarray(session.start_T_sonar.transformFrom(q))
+    return session.start_T_sonar.transformFrom(q)
 
 
 def _seen_from(world_T_sonar: gtsam.Pose3, place: Floats, landmark: int) -> TrueObjects:

@@ -24,8 +24,7 @@ from sonar_graph.files import (
 )
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, LandmarkDetections
-from sonar_graph.recognition.image_motion import is_alike
-from sonar_graph.sonar import Fan
+from sonar_graph.sonar import Fan, MadeOfWindow
 from sonar_graph.states import LandmarkMap
 
 RECOGNITION = "recognition.json"
@@ -182,10 +181,9 @@ class Recognition:
 
     def entry(self) -> dict[str, Any]:
         """Content for JSON, without detections and pictures."""
-        outcomes = dict(self.outcomes.most_common())
         return {
             "frames": self.frames,
-            "outcomes": outcomes,
+            "outcomes": dict(self.outcomes.most_common()),
             "warnings": self.warnings,
             "notes": self.notes,
         }
@@ -327,27 +325,13 @@ def as_jpeg(picture: Picture) -> bytes:
     return encoded.tobytes()
 
 
-class FrameFans:
-    """Fans of frames; frames of one window share theirs."""
-
-    def __init__(self) -> None:
-        self._last: tuple[SonarFrames, Fan] | None = None
-
-    def of(self, frame: SonarFrames, pixels_high: int = 420) -> Fan:
-        """Fan of a frame, for pictures this high."""
-        if self._last is None or not is_alike(frame, self._last[0]):
-            fan = Fan.of(frame.ranges_m, frame.azimuths_rad, pixels_high)
-            self._last = (frame, fan)
-        return self._last[1]
-
-
 class DrawnFrames:
     """Pictures spread evenly over a run whose length is not known: one a period, rather one with detections."""
 
     def __init__(self, image: SonarImage) -> None:
         self.pictures: list[DrawnFrame] = []
         self._image = image
-        self._fans = FrameFans()
+        self._fans = MadeOfWindow(Fan.of)
         self._period_ns = NS_PER_S
 
     def add(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:

@@ -230,4 +230,4 @@ def level_from_up(up: Floats) -> Floats:
 
 
 def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v))
+    return v / np.linalg.norm(v)

@@ -9,8 +9,8 @@ import numpy as np
 from sonar_graph.calibration import SonarImage
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, Floats
-from sonar_graph.recognition.recognition_record import FrameFans, as_jpeg, draw_fan
-from sonar_graph.sonar import Fan, RecognisedFrame
+from sonar_graph.recognition.recognition_record import as_jpeg, draw_fan
+from sonar_graph.sonar import Fan, MadeOfWindow, RecognisedFrame
 
 HALF_M = 0.35
 """Half of the side of a picture."""
@@ -57,14 +57,12 @@ class TrackStories:
         self.tracks: dict[int, TrackStory] = {}
         self.rejected: dict[str, Rejected] = {}
         self._image = image
-        self._fans = FrameFans()
+        self._fans = MadeOfWindow(fan_of_stories)
 
     def see(self, frame: SonarFrames, result: RecognisedFrame) -> None:
         """Take in the result for a block of one frame."""
         stamp_ns = result.stamp_ns
-        extent_m = float(np.ptp(frame.ranges_m))
-        fan = self._fans.of(frame, round(extent_m / HALF_M * SIDE_PIXELS / 2))
-        views = _Views(frame, self._image, fan)
+        views = _Views(frame, self._image, self._fans.of(frame))
         for number, sighting, _, beliefs in result.tracks:
             story = self.tracks.setdefault(number, TrackStory(number, stamp_ns))
             story.beliefs = beliefs
@@ -92,6 +90,12 @@ class TrackStories:
                     found.examples.append(
                         (stamp_ns, views.around(fate.range_m, fate.azimuth_rad))
                     )
+
+
+def fan_of_stories(ranges_m: Floats, azimuths_rad: Floats) -> Fan:
+    """Fan in which the square of a picture has its pixels."""
+    high = float(np.ptp(ranges_m)) / HALF_M * SIDE_PIXELS / 2
+    return Fan.of(ranges_m, azimuths_rad, round(high))
 
 
 class _Views:

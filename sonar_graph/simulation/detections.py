@@ -172,7 +172,7 @@ def inside(
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """True for points of the sonar's frame (last axis 3) inside the fan."""
     distance, azimuth, elevation = range_azimuth_elevation(points)
-    return np.asarray(
+    return (
         (distance >= fan.range_min_m)
         & (distance <= fan.range_max_m)
         & (np.abs(azimuth) <= fan.azimuth_half_rad)

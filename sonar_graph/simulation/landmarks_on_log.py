@@ -108,10 +108,8 @@ def add_landmarks(
                 f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}"
             )
     first_ns, path = reference_path(recorded)
-    world_rng, sonar_rng = (
-        np.random.default_rng(child)
-        for child in np.random.SeedSequence(options.seed).spawn(2)
-    )
+    children = np.random.SeedSequence(options.seed).spawn(2)
+    world_rng, sonar_rng = map(np.random.default_rng, children)
     world = landmarks_beside(path, options, world_rng)
     sonar = SonarCalibration(
         mounting=Mounting(),

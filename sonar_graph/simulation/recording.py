@@ -77,12 +77,8 @@ class Streams:
     @classmethod
     def of(cls, seed: int) -> Streams:
         """Spawn the streams of a seed."""
-        return cls(
-            *(
-                np.random.default_rng(child)
-                for child in np.random.SeedSequence(seed).spawn(8)
-            )
-        )
+        children = np.random.SeedSequence(seed).spawn(8)
+        return cls(*map(np.random.default_rng, children))
 
 
 def record(

@@ -111,8 +111,7 @@ def dvl_readings(motion: Kinematics, mounting: Mounting) -> Floats:
     at_dvl = at_body + np.cross(
         motion.angular_velocity, np.array(mounting.translation_m)
     )
-    readings: Floats = body_R_sensor(mounting).inv().apply(at_dvl)
-    return readings
+    return body_R_sensor(mounting).inv().apply(at_dvl)
 
 
 def simulate_dvl(

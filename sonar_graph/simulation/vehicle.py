@@ -102,8 +102,7 @@ def smooth_noise(
     spans = int(np.ceil(seconds[-1] / interval_s)) + 1
     knots = interval_s * np.arange(-DEGREE, spans + DEGREE + 1)
     coefficients = sigma * rng.standard_normal((spans + DEGREE, columns))
-    wandering: Floats = BSpline(knots, coefficients, DEGREE)(seconds)
-    return wandering
+    return BSpline(knots, coefficients, DEGREE)(seconds)
 
 
 def angular_motion(rpy: Floats, rate: Floats, change: Floats) -> tuple[Floats, Floats]:
@@ -195,5 +194,4 @@ def _distance(seconds: Floats, ramp_s: float) -> Floats:
     """Distance at unit final speed: the integral of the smoothstep 3u² - 2u³, then of 1."""
     # u^3 - u^4 / 2 is the integral of the smoothstep over u
     u = np.clip(seconds / ramp_s, 0, 1)
-    distance: Floats = ramp_s * (u**3 - u**4 / 2) + np.maximum(seconds - ramp_s, 0)
-    return distance
+    return ramp_s * (u**3 - u**4 / 2) + np.maximum(seconds - ramp_s, 0)

@@ -7,7 +7,7 @@ from sonar_graph.sonar.confusion import (
     SHIPPED, Confusion, confusion_for, mark_of, posterior_mean_rows, read_confusion, soft_scores,
 )
 from sonar_graph.sonar.evidence import EVIDENCE
-from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
+from sonar_graph.sonar.geometry import Fan, FloorView, MadeOfWindow, with_lens
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.recogniser import (
     REPORTED, Fate, RecognisedFrame, Recogniser, RecogniserParams, TrackInFrame,
@@ -15,7 +15,8 @@ from sonar_graph.sonar.recogniser import (
 from sonar_graph.sonar.tracker import SonarStep
 
 __all__ = [
-    "Confusion", "EVIDENCE", "Fan", "Fate", "FloorView", "FrameCheck", "IdentityParams", "ObjectSighting", "REPORTED",
-    "RecognisedFrame", "Recogniser", "RecogniserParams", "SHIPPED", "SLANT_PLANE", "SonarStep", "TrackInFrame",
-    "check_block", "confusion_for", "mark_of", "posterior_mean_rows", "read_confusion", "soft_scores", "with_lens",
+    "Confusion", "EVIDENCE", "Fan", "Fate", "FloorView", "FrameCheck", "IdentityParams", "MadeOfWindow",
+    "ObjectSighting", "REPORTED", "RecognisedFrame", "Recogniser", "RecogniserParams", "SHIPPED", "SLANT_PLANE",
+    "SonarStep", "TrackInFrame", "check_block", "confusion_for", "mark_of", "posterior_mean_rows", "read_confusion",
+    "soft_scores", "with_lens",
 ]

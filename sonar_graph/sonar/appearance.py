@@ -22,7 +22,7 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.evidence import Figures
-from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.geometry import FloorView, MadeOfWindow
 from sonar_graph.sonar.place import LONGEST_SHADOW, SHADE_FINE, Grid, Lit, Relief
 from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import (
@@ -132,9 +132,7 @@ class Appearance:
         params: AppearanceParams | None = None,
     ) -> None:
         self.params = params or AppearanceParams()
-        self.designs = len(designs)
-        self._designs = tuple(designs)
-        self._blur_m = blur_m
+        self._designs = designs
         # drawn once for a resolution: the search runs over them in every frame
         templates = Templates.of(
             designs, self.params.cell_m, self.params.margin_m, blur_m
@@ -152,7 +150,7 @@ class Appearance:
         )
         x, y = np.divmod(templates.cells, templates.side)
         self._compared = (x, y)
-        self._reliefs: dict[tuple[int, int], Relief] = {}
+        self._grid = Grid(templates.side, self.params.cell_m, blur_m)
         pictures = templates.pictures
         squares = pictures**2
         self._search = Search(
@@ -161,7 +159,7 @@ class Appearance:
             pictures=pictures,
             squares=squares,
             sums=np.stack([pictures.sum(axis=1), squares.sum(axis=1)]),
-            first=np.searchsorted(templates.design, np.arange(self.designs + 1)),
+            first=np.searchsorted(templates.design, np.arange(len(designs) + 1)),
             row=numbered_places(2 * self._steps + 1),
         )
 
@@ -196,7 +194,8 @@ class Appearance:
         whose figure lies beside it.
         """
         cell_m = self.params.cell_m
-        relief_m = self._designs[design].standing_m
+        of_design = self._designs[design]
+        relief_m = of_design.standing_m
         row = int(fit.template[design])
         edge = int(fit.edge[design])
         to_middle_m = self._to_middle_m[row]
@@ -204,7 +203,8 @@ class Appearance:
         # from the far edge at the top to where the ray meets the plane again, in that plane
         shadow_m = relief_m * (grazing_slope + 1 / grazing_slope)
         shade = min(shadow_m / cell_m * FINE / SHADE_FINE, LONGEST_SHADOW)
-        relief = self._relief(design, row, int(shade))
+        heading_rad = float(self.templates.heading_rad[row])
+        relief = Relief.of(of_design, heading_rad, self._grid, int(shade))
         # two lengths of the shadow are drawn; in between they are interpolated
         lit = Lit(relief_m * grazing_slope, shade - int(shade))
         start = (fit.centre_m[design] - to_middle_m - patch.centre_m) / cell_m + origin
@@ -229,17 +229,6 @@ class Appearance:
             bound_m=cell_m / math.sqrt(self.figures.independent) * bound,
             moved_m=np.stack([moved_m, turned_m]),
         )
-
-    def _relief(self, design: int, row: int, steps: int) -> Relief:
-        """Relief of a design at the heading of a template, with shadows of so many steps and one more."""
-        if (row, steps) not in self._reliefs:
-            self._reliefs[row, steps] = Relief.of(
-                self._designs[design],
-                float(self.templates.heading_rad[row]),
-                Grid(self.templates.side, self.params.cell_m, self._blur_m),
-                steps,
-            )
-        return self._reliefs[row, steps]
 
 
 def numbered_places(side: int) -> Ints:
@@ -522,8 +511,7 @@ class CandidateFit:
         self._confusion = confusion
         self._weights = np.array(confusion.weights)
         self._aperture_rad = elevation_aperture_rad
-        self._grid: PolarGrid | None = None
-        self._shape: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
+        self._grids = MadeOfWindow(self._grid)
 
     def at(
         self,
@@ -534,7 +522,7 @@ class CandidateFit:
         rows: Ints,
     ) -> list[ObjectSighting | None]:
         """Sightings of the candidates in these rows; None for a row of -1."""
-        grid = self._grid_of(frame)
+        grid = self._grids.of(frame)
         # without a floor, patches lie in the plane of the image
         plane = view or SLANT_PLANE
         seen = rows[rows >= 0]
@@ -551,17 +539,8 @@ class CandidateFit:
         of_seen = iter(self._sightings(view, range_m, azimuth_rad, bearing_rad, fits))
         return [None if row < 0 else next(of_seen) for row in rows.tolist()]
 
-    def _grid_of(self, frame: SonarFrames) -> PolarGrid:
-        """Grid of a frame; that of the frame before where ranges and azimuths are the same."""
-        shape = (frame.ranges_m, frame.azimuths_rad)
-        is_same = (
-            one is other or np.array_equal(one, other)
-            for one, other in zip(self._shape, shape, strict=True)
-        )
-        if self._grid is None or not all(is_same):
-            self._grid = PolarGrid.of(*shape, self._aperture_rad)
-            self._shape = shape
-        return self._grid
+    def _grid(self, ranges_m: Floats, azimuths_rad: Floats) -> PolarGrid:
+        return PolarGrid.of(ranges_m, azimuths_rad, self._aperture_rad)
 
     def _fit(
         self,
@@ -602,8 +581,7 @@ class CandidateFit:
 
         Candidates are seen from so far to so far below the horizon.
         """
-        grid = PolarGrid.of(ranges_m, azimuths_rad, self._aperture_rad)
-        in_view = grid.steps_in_view(
+        in_view = self._grid(ranges_m, azimuths_rad).steps_in_view(
             float(ranges_m[0]), float(ranges_m[-1]), depressions_rad
         )
         for steps in in_view[:MOST_PREPARED]:

@@ -43,7 +43,7 @@ def predict(
     """Predict beliefs by equation (1), with the belief about a new track, shape (K,), and e for all or each track."""
     carried = association[:, :-1] @ beliefs + association[:, -1:] * birth
     total = carried.sum(axis=1, keepdims=True)
-    return np.asarray((1 - forgetting) * carried + forgetting * total * birth)
+    return (1 - forgetting) * carried + forgetting * total * birth
 
 
 def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
@@ -76,9 +76,7 @@ def bounded_evidence(
     log_belief = np.log(birth) + log_odds / (counted + looks)[:, None]
     # the largest exponent is 0: no overflow
     odds = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
-    return np.asarray(
-        (1 - doubt) * odds / odds.sum(axis=1, keepdims=True) + doubt * birth
-    )
+    return (1 - doubt) * odds / odds.sum(axis=1, keepdims=True) + doubt * birth
 
 
 def independent_share(moved_m: Floats, aperture_m: float) -> Floats:
@@ -95,7 +93,7 @@ def independent_share(moved_m: Floats, aperture_m: float) -> Floats:
     # beyond the aperture speckle is independent
     u = np.minimum(2.0 * np.abs(moved_m) / aperture_m, 2.0)
     rho = np.where(u <= 1, 1 - 1.5 * u**2 + 0.75 * u**3, 0.25 * (2 - u) ** 3)
-    return np.asarray(1.0 - rho**2)
+    return 1.0 - rho**2
 
 
 class IdentityParams(Section):

@@ -46,7 +46,7 @@ def soft_scores(log_odds: Floats, looks: float) -> Floats:
     """
     share = log_odds / (1.0 + looks)
     odds = np.exp(share - share.max(axis=1, keepdims=True))
-    return np.asarray(odds / odds.sum(axis=1, keepdims=True))
+    return odds / odds.sum(axis=1, keepdims=True)
 
 
 class DesignMark(Section):
@@ -166,7 +166,7 @@ class Confusion(Section):
 
     def log_odds(self, evidence: Floats) -> Floats:
         """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 11)."""
-        return np.asarray(evidence @ np.array(self.weights))
+        return evidence @ np.array(self.weights)
 
     def range_azimuth_cov(self, bound_m: Floats, range_m: Floats) -> Floats:
         """Covariances of range and azimuth, shape (n, 2, 2), for `ObjectSighting.bound_m` (n, 2) at ranges (n,).
@@ -197,9 +197,7 @@ def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
     confusion that never happened in n trials keeps about 1 / 2n.
     """
     n = trials[:, None]
-    return np.asarray(
-        (n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1])
-    )
+    return (n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1])
 
 
 def mark_of(design: LandmarkDesign) -> DesignMark:

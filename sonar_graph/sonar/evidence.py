@@ -35,7 +35,7 @@ from sonar_graph.sonar.templates import (
     Patch,
     Templates,
     drawn,
-    material_radius_m,
+    places_around,
 )
 
 Bools = NDArray[np.bool_]
@@ -193,30 +193,32 @@ class Figures(NamedTuple):
             _figure(designs[index], float(heading_rad), grid, blur_m, patch_side)
             for index, heading_rad in pairs
         ]
+        cells, values, smooth, zones, uncovered, has_dark, radius_m = zip(
+            *figures, strict=True
+        )
         gram = []
         kept = []
-        for one in figures:
+        for own, own_uncovered in zip(values, uncovered, strict=True):
             # over all cells: a patch that is seen whole needs no sum over cells again
-            in_steps = one.values.astype(float)
+            in_steps = own.astype(float)
             gram.append(float(STEP) ** 2 * (in_steps.T @ in_steps))
-            all_seen = np.ones(len(one.values), np.float32)
-            kept.append(kept_sums(one.values, all_seen, one.uncovered))
+            kept.append(kept_sums(own, np.ones(len(own), np.float32), own_uncovered))
         # a cell narrower than the width of the blur at half power repeats its neighbour
         independent = math.prod(
             min(templates.cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m
         )
         return cls(
             patch_side=patch_side,
-            first=np.cumsum([0, *(len(one.cells) for one in figures)]),
-            cells=np.concatenate([one.cells for one in figures]),
-            values=np.concatenate([one.values for one in figures]),
-            smooth=np.concatenate([one.smooth for one in figures]),
-            zones=np.concatenate([one.zones for one in figures]),
+            first=np.cumsum([0, *map(len, cells)]),
+            cells=np.concatenate(cells),
+            values=np.concatenate(values),
+            smooth=np.concatenate(smooth),
+            zones=np.concatenate(zones),
             gram=np.array(gram),
-            has_dark=np.array([one.has_dark for one in figures]),
-            uncovered=np.concatenate([one.uncovered for one in figures]),
+            has_dark=np.array(has_dark),
+            uncovered=np.concatenate(uncovered),
             kept=np.array(kept),
-            radius_m=np.array([one.radius_m for one in figures]),
+            radius_m=np.array(radius_m),
             independent=independent,
             counts=_counts(independent),
         )
@@ -242,7 +244,7 @@ class Figures(NamedTuple):
         """Whether places about the middle of a template lie on the uncovered side of an edge."""
         direction, offset = divmod(edge, len(OFFSETS))
         reach_m = OFFSETS[offset] * self.radius_m[template]
-        return np.asarray(along_edge(x_m, y_m, direction) <= reach_m)
+        return along_edge(x_m, y_m, direction) <= reach_m
 
 
 class _Grid(NamedTuple):
@@ -261,11 +263,7 @@ class _Grid(NamedTuple):
 
     @classmethod
     def of(cls, designs: Sequence[LandmarkDesign], cell_m: float) -> _Grid:
-        material_m = max(map(material_radius_m, designs))
-        half = math.ceil((material_m + SHADOW_M) / cell_m)
-        places_m = cell_m * np.arange(-half, half + 1)
-        x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
-        away_m = np.hypot(x_m, y_m)
+        x_m, y_m, away_m, material_m = places_around(designs, SHADOW_M, cell_m)
         is_around = away_m <= material_m + REACH_M
         # within 60 degrees of the direction away from the sonar, where a shadow falls
         is_behind = (away_m <= material_m + SHADOW_M) & (x_m > 0.5 * away_m)
@@ -333,7 +331,7 @@ def _zones(figure: Floats32, dark: Floats32, is_compared: Bools) -> Ints:
     back = BEHIND * (is_out & is_behind)
     # a plate belongs to the design, so its cells are no floor
     far = FAR * (is_out & ~is_near & (dark < OUT))
-    return np.asarray(near + back + far)
+    return near + back + far
 
 
 def _counts(independent: float) -> Floats:
@@ -343,15 +341,6 @@ def _counts(independent: float) -> Floats:
         counts[EVIDENCE.index(name)] = independent
     counts[EVIDENCE.index("plate")] = math.sqrt(independent)
     return counts
-
-
-class PatchPart(NamedTuple):
-    """Cells of a patch row by row from one on; fields as in `Patch`."""
-
-    level_db: Floats32
-    seen: Floats32
-    smooth_db: Floats32
-    held: Floats32
 
 
 class View(NamedTuple):
@@ -377,8 +366,6 @@ class Products(NamedTuple):
     """``values^T z``, shape (2 + 2 figures,)."""
     total: float
     """``z^T z``."""
-    room: Floats
-    """Room for the elimination, shape (4, 5)."""
 
 
 class Left(NamedTuple):
@@ -412,14 +399,6 @@ class DesignFitted(NamedTuple):
     delta: float
 
 
-class Surroundings(NamedTuple):
-    """What is left next to the figure, farther out, and behind."""
-
-    near_db2: float
-    far_db2: float
-    behind_db: float
-
-
 @compiled
 def fill_evidence(
     figures: Figures,
@@ -438,11 +417,10 @@ def fill_evidence(
         begin = figures.first[template[k]]
         end = figures.first[template[k] + 1]
         shift = cell[k, 0] * figures.patch_side + cell[k, 1]
-        part = part_from(patch, shift)
-        cells = figures.cells[begin:end]
+        cells = figures.cells[begin:end] + shift
         values = figures.values[begin:end]
         uncovered = figures.uncovered[begin:end]
-        view = viewed(part, cells)
+        view = viewed(patch, cells)
         # a few cells fit any figure
         if view.cells < LEAST_CELLS:
             return False
@@ -452,24 +430,26 @@ def fill_evidence(
         products = products_in_view(figures.gram[template[k]], values, view)
         has_dark = figures.has_dark[template[k]]
         fit = design_fitted(products, view.cells, has_dark)
-        other = otherwise(products, fit)
+        other, other_without_shadow = otherwise(products, fit)
         smooth = figures.smooth[begin:end]
         zones = figures.zones[begin:end]
-        around = surroundings(part, cells, view, fit, smooth, zones)
+        near_db2, far_db2, behind_db = surroundings(
+            patch, cells, view, fit, smooth, zones
+        )
         kept = figures.kept[template[k]]
         # cut by the rim of the image: sums over all cells are too large
         if view.cells < len(cells):
             kept = kept_sums(values, view.is_seen, uncovered)
-        covered = least_covered(view, values, uncovered, kept, products, fit)
+        covered, best_edge = least_covered(view, values, uncovered, kept, products, fit)
         # a figure darker than the floor is no figure of foam
         whole = fit.design if fit.beta > 0 else fit.without_figure
         cells_count = 0.5 * view.cells * figures.counts[COVERED]
         # log likelihood ratio of the covered figure against the whole one
-        gain = cells_count * math.log(max(whole / covered.squares, 1.0))
+        gain = cells_count * math.log(max(whole / covered, 1.0))
         # prior odds: 1/2 for the whole figure, 1/72 for each edge
         if gain > math.log(EDGES * len(OFFSETS)):
-            edge[k] = covered.edge
-        left = min(covered.squares, whole)
+            edge[k] = best_edge
+        left = min(covered, whole)
         sigma = math.sqrt(fit.design / view.cells)
         # gain of D, then gain of B: a plate without foam is another thing that lies there
         plate = math.log(fit.shaded / fit.both)
@@ -477,12 +457,12 @@ def fill_evidence(
         plate_and_foam = max(min(plate, foam), 0.0)
         pieces = Evidence(
             1.0,
-            math.log(other.squares / fit.both),
-            math.log(other.without_last / fit.plain),
+            math.log(other / fit.both),
+            math.log(other_without_shadow / fit.plain),
             math.log(max(fit.beta, LEAST_BETA_DB) / sigma),
-            math.log(around.near_db2 + LEAST_DB2),
-            math.log(around.far_db2 + LEAST_DB2),
-            around.behind_db,
+            math.log(near_db2 + LEAST_DB2),
+            math.log(far_db2 + LEAST_DB2),
+            behind_db,
             math.sqrt(plate_and_foam) if fit.delta < 0 else 0.0,
             0.0 if has_dark else 1.0,
             math.log(left / view.total),
@@ -494,26 +474,10 @@ def fill_evidence(
 
 
 @compiled
-def part_from(patch: Patch, first: int) -> PatchPart:
-    """A patch from one of its cells on."""
-    return PatchPart(
-        patch.level_db.ravel()[first:],
-        patch.seen.ravel()[first:],
-        patch.smooth_db.ravel()[first:],
-        patch.held.ravel()[first:],
-    )
-
-
-@compiled
-def viewed(part: PatchPart, cells: NDArray[np.int32]) -> View:
-    """The levels of a part of a patch in some cells."""
-    part_db = part.level_db
-    part_seen = part.seen
-    level_db = np.empty(len(cells), np.float32)
-    is_seen = np.empty(len(cells), np.float32)
-    for n in range(len(cells)):
-        level_db[n] = part_db[cells[n]]
-        is_seen[n] = part_seen[cells[n]]
+def viewed(patch: Patch, cells: Ints) -> View:
+    """The levels of a patch in some cells."""
+    level_db = patch.level_db.ravel()[cells]
+    is_seen = patch.seen.ravel()[cells]
     count = float(np.dot(is_seen, is_seen))
     # the floor is one of the columns; without the mean, sums of squares lose fewer digits
     mean_db = np.float32(np.dot(level_db, is_seen) / max(count, 1.0))
@@ -527,17 +491,13 @@ def viewed(part: PatchPart, cells: NDArray[np.int32]) -> View:
 def products_in_view(gram: Floats, values: Bytes, view: View) -> Products:
     """Products of the columns with each other and with the levels, without the cells that are not in view."""
     levels = products_of(view.level_db, values)
-    room = np.empty((4, 5))
-    # nothing is cut: the table has the products
-    if view.cells == len(values):
-        return Products(gram, levels, view.total, room)
     in_view = gram.copy()
     for n in range(len(values)):
         if view.is_seen[n] == 0:
             for i in range(len(gram)):
                 for j in range(len(gram)):
                     in_view[i, j] -= (STEP * values[n, i]) * (STEP * values[n, j])
-    return Products(in_view, levels, view.total, room)
+    return Products(in_view, levels, view.total)
 
 
 @compiled
@@ -579,7 +539,7 @@ def design_fitted(products: Products, count: float, has_dark: bool) -> DesignFit
 
 
 @compiled
-def otherwise(products: Products, fit: DesignFitted) -> Left:
+def otherwise(products: Products, fit: DesignFitted) -> tuple[float, float]:
     """Least that any figure of `STRETCHES` leaves, with a shadow where it is dark, and without one."""
     squares = fit.shaded
     without_shadow = fit.plain
@@ -589,16 +549,16 @@ def otherwise(products: Products, fit: DesignFitted) -> Left:
         without_shadow = min(without_shadow, one.without_last)
         is_dark = one.levels[2] < 0
         squares = min(squares, one.squares if is_dark else one.without_last)
-    return Left(squares, without_shadow, np.zeros(0))
+    return squares, without_shadow
 
 
 @compiled
 def surroundings(
-    part: PatchPart, cells: NDArray[np.int32], view: View, fit: DesignFitted, smooth: Floats32, zones: Bytes
-) -> Surroundings:  # fmt: skip
+    patch: Patch, cells: Ints, view: View, fit: DesignFitted, smooth: Floats32, zones: Bytes
+) -> tuple[float, float, float]:  # fmt: skip
     """Mean squares of what is brighter than the design next to it and darker farther out, and the level behind it."""
-    smooth_db = part.smooth_db
-    held = part.held
+    smooth_db = patch.smooth_db.ravel()
+    held = patch.held.ravel()
     level_db = view.level_db
     is_seen = view.is_seen
     near = 0.0
@@ -627,7 +587,7 @@ def surroundings(
             back_cells += 1
     # of smooth speckle, where too few cells are in view
     speckle_db2 = fit.design / view.cells / 3
-    return Surroundings(
+    return (
         near / near_cells if near_cells > 8 else speckle_db2,
         far / far_cells if far_cells > 8 else speckle_db2,
         back / back_cells if back_cells > 5 else 0.0,
@@ -670,21 +630,14 @@ def kept_sums(values: Bytes, seen: Floats32, uncovered: Bytes) -> Floats:
     return kept
 
 
-class Covered(NamedTuple):
-    """The figure that is covered beyond the best edge."""
-
-    squares: float
-    edge: int
-    """-1: no part of the figure is brighter than the floor."""
-
-
 @compiled
 def least_covered(
     view: View, values: Bytes, uncovered: Bytes, kept: Floats, products: Products, fit: DesignFitted
-) -> Covered:  # fmt: skip
+) -> tuple[float, int]:  # fmt: skip
     """Least sum of squares that a figure leaves when all of it beyond a straight edge is covered, and that edge.
 
-    The floor and D are taken out of the figure first: ``R = R(floor, D) - (b^T z)^2 / b^T b``.
+    Edge -1: no part of the figure is brighter than the floor. The floor and D are taken out of the figure first: ``R =
+    R(floor, D) - (b^T z)^2 / b^T b``.
     """
     bright = np.zeros(len(kept), np.float32)  # b^T z
     level_db = view.level_db
@@ -715,20 +668,20 @@ def least_covered(
             if left < least:
                 least = left
                 best = edge
-    return Covered(max(least, LEAST_LEFT_DB2), best)
+    return max(least, LEAST_LEFT_DB2), best
 
 
 def along_edge(x_m: Floats, y_m: Floats, direction: int) -> Floats:
     """How far places lie in one of `EDGES` directions."""
     towards_rad = 2 * math.pi * direction / EDGES
-    return np.asarray(x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad))
+    return x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
 
 
 @compiled
 def least_squares(products: Products, columns: tuple[int, ...]) -> Left:
     """What some columns leave, by elimination: with ``G = L D L^T``, ``L y = g`` column i takes ``y_i^2 / D_i``."""
     n = len(columns)
-    a = products.room
+    a = np.empty((n, n + 1))
     for i in range(n):
         for j in range(n):
             a[i, j] = products.gram[columns[i], columns[j]]
@@ -750,11 +703,7 @@ def least_squares(products: Products, columns: tuple[int, ...]) -> Left:
         levels[i] = a[i, n] / a[i, i]
         for k in range(i):
             a[k, n] -= a[k, i] * levels[i]
-    return Left(
-        max(left, LEAST_LEFT_DB2),
-        max(without_last, LEAST_LEFT_DB2),
-        levels,
-    )
+    return Left(max(left, LEAST_LEFT_DB2), max(without_last, LEAST_LEFT_DB2), levels)
 
 
 def behind(figure: Floats32, cells: int) -> Floats32:

@@ -12,8 +12,10 @@ the upward direction in the sonar frame, ``u . q = -h`` gives e; of two solution
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Generic, TypeVar
 
 import gtsam
 import numpy as np
@@ -131,10 +133,9 @@ class FloorView:
         along = points_m @ up
         horizontal2 = np.maximum(np.sum(points_m**2, axis=1) - along**2, 0.0)
         slope = np.abs(_elevation_derivatives(points_m) @ up)
-        return np.asarray(
-            np.sqrt(self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2)
-            / np.maximum(slope, 1e-9)
-        )
+        return np.sqrt(
+            self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2
+        ) / np.maximum(slope, 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +196,29 @@ class Fan:
         return round(column), round(
             len(self.beam) - (ahead - self.lowest_m) * self.pixels_per_m
         )
+
+
+Made = TypeVar("Made")
+
+
+class MadeOfWindow(Generic[Made]):
+    """What is made of the ranges and azimuths of frames, and again where these change."""
+
+    def __init__(self, make: Callable[[Floats, Floats], Made]) -> None:
+        self._make = make
+        self._last: tuple[SonarFrames, Made] | None = None
+
+    def of(self, frame: SonarFrames) -> Made:
+        """What is made of a frame; that of the frame before where ranges and azimuths are the same."""
+        if self._last is None or not is_alike(self._last[0], frame):
+            self._last = (frame, self._make(frame.ranges_m, frame.azimuths_rad))
+        return self._last[1]
+
+
+def is_alike(one: SonarFrames, other: SonarFrames) -> bool:
+    """True for frames with the same beams and bins."""
+    pairs = (one.ranges_m, other.ranges_m), (one.azimuths_rad, other.azimuths_rad)
+    return all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
 def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
@@ -281,7 +305,7 @@ def point_covariances(
     spherical = np.zeros((len(r), 3, 3))
     spherical[:, :2, :2] = range_azimuth_cov
     spherical[:, 2, 2] = elevation_sigmas_rad**2
-    return np.asarray(jacobian @ spherical @ jacobian.transpose(0, 2, 1))
+    return jacobian @ spherical @ jacobian.transpose(0, 2, 1)
 
 
 def _elevation_derivatives(points_m: Floats) -> Floats:

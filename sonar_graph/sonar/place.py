@@ -14,6 +14,7 @@ figures at the levels before. Derivation: docs/theory/recognition.md.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,8 @@ SHADE_FINE = FINE // 2
 """Step of the lengths of shadows that are drawn, in points of the fine grid."""
 LONGEST_SHADOW = 12
 """In such steps."""
+MOST_RELIEFS = 2048
+"""Drawings that are kept, some 25 kB each."""
 STEPS = 2
 """Gauss-Newton steps from the best cell on."""
 LEAST_BETA_DB = 0.05
@@ -77,6 +80,7 @@ class Relief(NamedTuple):
     """The same of one step more."""
 
     @classmethod
+    @lru_cache(maxsize=MOST_RELIEFS)
     def of(
         cls, design: LandmarkDesign, heading_rad: float, grid: Grid, shade_steps: int
     ) -> Relief:
@@ -123,21 +127,13 @@ class Relief(NamedTuple):
         """
         place = start.astype(float)
         bound = np.full(2, np.inf)
-        rows, columns = cells
-        fit_place(self, patch, ComparedCells(rows, columns), lit, place, bound)
+        fit_place(self, patch, cells, lit, place, bound)
         return place, bound
-
-
-class ComparedCells(NamedTuple):
-    """Cells of the figure's square that are compared."""
-
-    rows: Ints
-    columns: Ints
 
 
 @compiled
 def fit_place(
-    relief: Relief, patch: Patch, cells: ComparedCells, lit: Lit, place: Floats, bound: Floats
+    relief: Relief, patch: Patch, cells: tuple[Ints, Ints], lit: Lit, place: Floats, bound: Floats
 ) -> None:  # fmt: skip
     """Move a place to the least squares, and fill in the Cramer-Rao bound of its standard deviations, in cells.
 
@@ -158,8 +154,7 @@ def fit_place(
     mean_db = np.float32(np.sum(patch.level_db * patch.seen) / seen_cells)
     level_db = patch.level_db
     seen = patch.seen
-    rows = cells.rows
-    columns = cells.columns
+    rows, columns = cells
     last = len(level_db) - 1
     M = np.empty((7, len(rows)), np.float32)
     for step in range(STEPS + 1):

@@ -286,7 +286,7 @@ class Recogniser:
         across = np.column_stack(
             [-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)]
         )
-        sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
+        sideways = across @ self._start_T_sonar.rotation().matrix().T
         place = self._start_T_sonar.translation()
         beliefs, shares = self._beliefs.step(
             association, log_odds, is_fitted, place, sideways

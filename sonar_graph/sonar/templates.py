@@ -82,13 +82,9 @@ class Templates:
         Around the largest design lies a ring of floor, without the part behind it, which the design may shade: the x
         axis of the grid points away from the sonar.
         """
-        material_m = max(map(material_radius_m, designs))
-        half = math.ceil((material_m + margin_m) / cell_m)
-        side = 2 * half + 1
-        places_m = cell_m * np.arange(-half, half + 1)
-        x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
+        x_m, _, away_m, material_m = places_around(designs, margin_m, cell_m)
+        side = len(x_m)
         # a plate of 13 mm throws a shadow of 2 cm, which would pull the best fit away from the sonar
-        away_m = np.hypot(x_m, y_m)
         is_behind = (away_m > material_m) & (x_m > 0.5 * away_m)
         cells = np.flatnonzero((away_m <= material_m + margin_m) & ~is_behind)
         pictures: list[Floats32] = []
@@ -116,6 +112,17 @@ class Templates:
             np.array(of),
             np.array(headings),
         )
+
+
+def places_around(
+    designs: Sequence[LandmarkDesign], margin_m: float, cell_m: float
+) -> tuple[Floats, Floats, Floats, float]:
+    """Places x and y of a grid about the middle of the largest design, their distance from it, and its reach."""
+    material_m = max(map(material_radius_m, designs))
+    half = math.ceil((material_m + margin_m) / cell_m)
+    places_m = cell_m * np.arange(-half, half + 1)
+    x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
+    return x_m, y_m, np.hypot(x_m, y_m), material_m
 
 
 def drawn(
@@ -372,10 +379,10 @@ class PolarGrid(NamedTuple):
         cell_m: float,
     ) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
-        level, seen, smooth, held = np.zeros((4, side, side), np.float32)
-        patch = Patch(level, seen, smooth, held, centre_m)
-        sample_floor(self, image_db, view.level_R_sonar, view.height_m, cell_m, patch)
-        return patch
+        level_db, seen = np.zeros((2, side, side), np.float32)
+        floor = view.level_R_sonar, view.height_m
+        sample_floor(self, image_db, floor, cell_m, centre_m, level_db, seen)
+        return Patch.of(level_db, seen, centre_m)
 
 
 @inlined
@@ -431,20 +438,19 @@ def smooth_levels(
 def sample_floor(
     grid: PolarGrid,
     image_db: Floats32,
-    R: Floats,
-    height_m: float,
+    floor: tuple[Floats, float],
     cell_m: float,
-    patch: Patch,
+    centre: Floats,
+    level: Floats32,
+    seen: Floats32,
 ) -> None:
-    """Fill in the levels of a patch of zeros, 1 where a point is in the image, and both by `smooth_levels`.
+    """Fill in the levels around a centre, and 1 where a point is in the image, both 0 before.
 
     Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
-    between the two nearest; linear between beams. R is ``level_R_sonar``.
+    between the two nearest; linear between beams. The floor is ``level_R_sonar`` and the sonar's height over it.
     """
     (beams, bins) = image_db.shape
-    level = patch.level_db
-    seen = patch.seen
-    centre = patch.centre_m
+    R, height_m = floor
     side = len(level)
     nodes = grid.beam_of_azimuth
     per_bin = 1 / grid.bin_m
@@ -508,4 +514,3 @@ def sample_floor(
                     last - first + np.uint32(1)
                 )
             seen[i, j] = 1.0
-    smooth_levels(level, seen, patch.smooth_db, patch.held)

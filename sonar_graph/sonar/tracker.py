@@ -238,16 +238,13 @@ class Tracker:
         )
         self._gate = chi_square_quantile(self.params.gate_probability, 2)
         self._tracks = TrackStates.none()
-        self._skipped: SonarStep | None = None
+        self._skipped = SonarStep.none()
         self._stamp_ns: int | None = None
         self._next_id = 0
 
     def skip(self, motion: SonarStep) -> None:
         """Move the sonar without a usable frame."""
-        self._skipped = self._since_last_frame(motion)
-
-    def _since_last_frame(self, motion: SonarStep) -> SonarStep:
-        return motion if self._skipped is None else self._skipped.then(motion)
+        self._skipped = self._skipped.then(motion)
 
     def step(
         self, candidates: Candidates, motion: SonarStep | None, stamp_ns: int
@@ -265,14 +262,13 @@ class Tracker:
         elapsed_s = (
             0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         )
-        moved = self._tracks.moved(
-            self._since_last_frame(motion or SonarStep.none()), params.drift_m
-        )
+        self.skip(motion or SonarStep.none())
+        moved = self._tracks.moved(self._skipped, params.drift_m)
         before = replace(
             moved, existence=moved.existence * np.exp(-elapsed_s / params.lifetime_s)
         )
         self._stamp_ns = stamp_ns
-        self._skipped = None
+        self._skipped = SonarStep.none()
 
         z = np.array([candidates.range_m[rows], candidates.azimuth_rad[rows]]).T
         expected = Expected.of(before, self._noise)
@@ -290,7 +286,7 @@ class Tracker:
         unexplained = (params.new_per_frame + params.clutter_per_frame) / area
         weights = densities * (before.existence * detection)
         weights = np.hstack([weights, np.full((len(weights), 1), unexplained)])
-        matrix = np.asarray(weights / weights.sum(axis=1, keepdims=True))
+        matrix = weights / weights.sum(axis=1, keepdims=True)
         took = most_probable_assignment(matrix)
 
         # existence by Bayes: p(frame | exists) over p(frame | does not), with clutter in the denominator

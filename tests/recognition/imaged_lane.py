@@ -5,8 +5,10 @@ It holds in half a minute what a lap of the basin holds in two: for tests that n
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from sonar_graph.devices import DEFAULT_DESIGNS
@@ -55,6 +57,18 @@ class Lane:
         )
         write_log(log, self.sequence, _in_this_order(blocks))
         return log
+
+    def true_steps(self, rows: slice = slice(None)) -> list[gtsam.Pose3]:
+        """True motion of the sonar between frames, while there is truth."""
+        truth = self.sequence.truth
+        stamps = self.frames.stamps_ns[rows]
+        poses = truth.at(stamps[stamps <= truth.stamps_ns[-1]])
+        body_T_sonar = self.sequence.calibration.sonar.mounting.pose()
+        sonar = [
+            gtsam.Pose3(gtsam.Rot3(R), t) * body_T_sonar
+            for R, t in zip(poses.matrices, poses.positions, strict=True)
+        ]
+        return [before.inverse() * now for before, now in pairwise(sonar)]
 
     def one(self, row: int) -> SonarFrames:
         """A block of one frame."""

@@ -2,13 +2,13 @@
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError
-from sonar_graph.measurements import Floats
 from sonar_graph.recognition import (
     ClockOffset,
     ImageMotions,
@@ -25,30 +25,14 @@ NOISE = np.array([0.003, 0.002, 0.001])
 @pytest.fixture(scope="module")
 def steps(lane: Lane) -> list[PlanarStep]:
     """True motion of the lane in the sonar's plane, with the noise of motion from images."""
-    body_T_sonar = lane.sequence.calibration.sonar.mounting.pose()
     rng = np.random.default_rng(3)
-    stamps = lane.frames.stamps_ns[
-        lane.frames.stamps_ns <= lane.sequence.truth.stamps_ns[-1]
-    ]
-    poses = lane.sequence.truth.at(stamps)
-    sonar = [
-        gtsam.Pose3(gtsam.Rot3(R), t) * body_T_sonar
-        for R, t in zip(poses.matrices, poses.positions, strict=True)
-    ]
+    stamps = pairwise(lane.frames.stamps_ns.tolist())
     found = []
-    for k in range(1, len(sonar)):
-        tangent = gtsam.Pose3.Logmap(sonar[k - 1].inverse() * sonar[k])
+    for begin_and_end_ns, step in zip(stamps, lane.true_steps(), strict=False):
         yaw, ahead, across = NOISE * rng.standard_normal(3)
-        motion = tangent[[2, 3, 4]] + np.array([yaw, ahead, across - RANGE_M * yaw])
-        found.append(
-            PlanarStep(
-                int(stamps[k - 1]),
-                int(stamps[k]),
-                motion,
-                np.diag(NOISE**2),
-                is_measured=True,
-            )
-        )
+        noise = np.array([yaw, ahead, across - RANGE_M * yaw])
+        motion = gtsam.Pose3.Logmap(step)[[2, 3, 4]] + noise
+        found.append(PlanarStep(*begin_and_end_ns, motion, np.diag(NOISE**2), True))
     return found
 
 
@@ -66,19 +50,17 @@ def estimated(
     return estimate_offset(moved(steps, offset_s), lane.sequence, RANGE_M, **search)
 
 
-@pytest.mark.parametrize("offset_s", [0.0, 1.37, -4.2])
-def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s):
-    found = estimated(lane, steps, offset_s)
+@pytest.mark.parametrize(
+    ("offset_s", "search"),
+    [(1.37, {}), (-4.2, {}), (50.3, {"around_s": 50.0, "search_s": 2.0})],
+)
+def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s, search):
+    found = estimated(lane, steps, offset_s, **search)
     assert abs(found.seconds - offset_s) < 3 * found.sigma_s + 0.01
     assert found.sigma_s < 0.1
     assert re.match(
-        r"[+-]\d\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found)
+        r"[+-]\d+\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found)
     )
-
-
-def test_an_offset_is_searched_about_what_was_stated(lane, steps):
-    found = estimated(lane, steps, 50.3, around_s=50.0, search_s=2.0)
-    assert abs(found.seconds - 50.3) < 3 * found.sigma_s + 0.01
 
 
 def test_steps_that_err_wildly_are_left_out(lane, steps):
@@ -89,31 +71,18 @@ def test_steps_that_err_wildly_are_left_out(lane, steps):
     assert abs(found.seconds - 0.9) < 3 * found.sigma_s + 0.02
 
 
-def replaced(steps: list[PlanarStep], motions: Floats) -> list[PlanarStep]:
-    return [
-        replace(step, motion=motion)
-        for step, motion in zip(steps, motions, strict=True)
-    ]
-
-
 def test_images_that_cannot_tell_are_refused_with_the_reason(lane, steps):
-    noise = NOISE * np.random.default_rng(4).standard_normal((len(steps), 3))
-    with pytest.raises(
-        LogError, match=r"do not determine .*; state it with --offset SECONDS"
+    rng = np.random.default_rng(4)
+    noise = [replace(s, motion=NOISE * rng.standard_normal(3)) for s in steps]
+    not_measured = [replace(step, is_measured=False) for step in steps]
+    for given, offset_s, search_s, words in (
+        (noise, 0.0, 10.0, r"do not determine .*; state it with --offset SECONDS"),
+        (not_measured, 0.0, 1.0, r"\d+ of \d+ steps between them could be measured"),
+        (steps, 500.0, 1.0, r"fewer than 50 steps between them lie in IMU and"),
+        (steps, 1.5, 1.4, r"is at the end of the search; give a longer --search"),
     ):
-        estimated(lane, replaced(steps, noise), 0.0)
-    with pytest.raises(
-        LogError, match=r"\d+ of \d+ steps between them could be measured"
-    ):
-        estimated(lane, [replace(step, is_measured=False) for step in steps], 0.0)
-    with pytest.raises(
-        LogError, match=r"fewer than 50 steps between them lie in IMU and"
-    ):
-        estimated(lane, steps, 500.0)
-    with pytest.raises(
-        LogError, match=r"is at the end of the search; give a longer --search"
-    ):
-        estimated(lane, steps, 1.5, search_s=1.4)
+        with pytest.raises(LogError, match=words):
+            estimated(lane, given, offset_s, search_s=search_s)
 
 
 def test_the_motion_of_images_tells_the_offset(lane):

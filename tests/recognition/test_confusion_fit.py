@@ -20,30 +20,19 @@ from sonar_graph.sonar import (
     confusion_for,
     soft_scores,
 )
-from sonar_graph.sonar.appearance import DesignFit
 from sonar_graph.sonar.bayes import bounded_evidence
 
 BOUND = np.array([0.003, 0.0008])
-MOVED = np.array([0.0, 0.004])
 IDS = np.array([5, 3])
 RANGE_M = np.array([2.0, 1.5])
 AZIMUTH_RAD = np.array([0.1, -0.2])
 
 
-def sighting(
-    range_m: float, azimuth_rad: float, *, is_compared: bool = True
-) -> ObjectSighting:
-    evidence = np.outer([0.9, 0.3], np.ones(len(EVIDENCE)))
-    if not is_compared:
-        return ObjectSighting(None, range_m, azimuth_rad, np.eye(2), 0.5)
-    fit = DesignFit(
-        evidence, 0.95, np.zeros(2), np.zeros((2, 2)), np.zeros(2, int), np.full(2, -1)
-    )
-    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), 0.5, BOUND, MOVED)
-
-
 def test_a_sighting_is_of_what_truly_lies_there():
-    behind = np.array([0.1 + np.pi, -0.2 - np.pi])
+    there = confusion_fit.TrueObjects(IDS, RANGE_M, AZIMUTH_RAD)
+    behind = confusion_fit.TrueObjects(
+        IDS, RANGE_M, np.array([0.1 + np.pi, -0.2 - np.pi])
+    )
     for place, label in (
         ((2.07, 0.1), 5),
         ((2.0, 0.1 + 0.07 / 2), 5),
@@ -54,18 +43,9 @@ def test_a_sighting_is_of_what_truly_lies_there():
         ((2.41, 0.1), confusion_fit.NONE),
         ((2.0, 0.1 + 0.42 / 2), confusion_fit.NONE),
     ):
-        assert (
-            confusion_fit.TrueObjects(IDS, RANGE_M, AZIMUTH_RAD).label_of(
-                sighting(*place)
-            )[0]
-            == label
-        ), place
-        assert (
-            confusion_fit.TrueObjects(IDS, RANGE_M, behind).label_of(sighting(*place))[
-                0
-            ]
-            == confusion_fit.NONE
-        ), place
+        seen = ObjectSighting(None, *place, np.eye(2))
+        assert there.label_of(seen)[0] == label, place
+        assert behind.label_of(seen)[0] == confusion_fit.NONE, place
 
 
 @given(st.integers(0, 27))

@@ -1,36 +1,20 @@
 """Motion from the images alone, against the true motion of the lane, and what is recognised with it."""
 
-from itertools import pairwise
-
 import gtsam
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import (
     ImagesAlone,
-    lacking_navigation,
-    read_images_alone,
-    read_log,
-    write_log,
 )
 from sonar_graph.measurements import Floats
-from sonar_graph.recognition import ImageMotions, Recognition, RecognitionSession
+from sonar_graph.recognition import ImageMotions, one_by_one, recognise_images
 from tests.recognition.imaged_lane import Lane
 
 SURE = 0.9
 RANGE_M = 1.9
 """RANGE_M: the middle of the images, where motion across the line of sight is seen best."""
-
-
-def true_steps(lane: Lane, rows: range, body_T_sonar: gtsam.Pose3) -> list[gtsam.Pose3]:
-    poses = lane.sequence.truth.at(lane.frames.stamps_ns[rows.start : rows.stop])
-    pairs = zip(poses.matrices, poses.positions, strict=True)
-    sonar = [
-        gtsam.Pose3(gtsam.Rot3(matrix), place) * body_T_sonar for matrix, place in pairs
-    ]
-    return [before.inverse() * now for before, now in pairwise(sonar)]
 
 
 def in_plane(steps: list[gtsam.Pose3], level_R_sonar: Floats) -> Floats:
@@ -55,9 +39,7 @@ def test_steps_are_the_true_ones_within_their_covariance(lane, is_floor_known):
     assert (motions.view is not None) == is_floor_known
     assert motions.measured == motions.steps == len(rows) - 1
     level_R_sonar = np.eye(3) if motions.view is None else motions.view.level_R_sonar
-    true = in_plane(
-        true_steps(lane, rows, calibration.sonar.mounting.pose()), level_R_sonar
-    )
+    true = in_plane(lane.true_steps(slice(len(rows))), level_R_sonar)
     found = np.array([step.motion for step in steps])
     errors = found - true
     across = errors[:, 2] + RANGE_M * errors[:, 0]
@@ -96,16 +78,13 @@ def test_a_fixed_sonar_does_not_move_whatever_its_images_show(lane):
     assert not step.covariance.any()
 
 
-def recognised(lane: Lane, calibration: Calibration) -> Recognition:
-    alone = ImagesAlone("lane", calibration, int(lane.frames.stamps_ns[0]), {})
-    session = RecognitionSession(alone, pictures=False)
-    for row in range(len(lane.frames)):
-        session.take(lane.one(row))
-    return session.finish()
-
-
 def test_landmarks_are_recognised_by_images_alone(lane, lane_recognition):
-    found = recognised(lane, lane.sequence.calibration)
+    calibration = lane.sequence.calibration
+    alone = ImagesAlone("lane", calibration, int(lane.frames.stamps_ns[0]), {})
+    counts = []
+    frames = one_by_one(lane.frames)
+    found = recognise_images(frames, alone, progress=counts.append)
+    assert counts == list(range(1, len(lane.frames) + 1))
     named, probability = found.detections.most_probable()
     assert set(named[probability > SURE].tolist()) == {1, 2, 3, 4}
     expected = lane_recognition.detections
@@ -114,12 +93,3 @@ def test_landmarks_are_recognised_by_images_alone(lane, lane_recognition):
         stamps & set(found.detections.stamps_ns[probability > SURE].tolist())
     ) > 0.5 * len(stamps)
     assert found.notes["detections.motion"].startswith("from the images")
-
-
-def test_what_a_log_lacks_is_known_before_it_is_read(lane, lane_log, tmp_path):
-    assert lacking_navigation(lane_log, {}) == []
-    assert read_images_alone(lane_log).calibration == read_log(lane_log).calibration
-    assert read_images_alone(lane_log).start_ns == lane.frames.stamps_ns[0]
-    write_log(tmp_path / "bare.mcap", lane.sequence)
-    with pytest.raises(Exception, match=r"bare\.mcap: has no sonar images"):
-        read_images_alone(tmp_path / "bare.mcap")

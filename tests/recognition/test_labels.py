@@ -26,41 +26,25 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
     given = []
     rng = np.random.default_rng(2)
     run = lane.sequence
-    for stamp_ns in lane.frames.stamps_ns[::6].tolist():
-        if not run.truth.stamps_ns[0] <= stamp_ns <= run.truth.stamps_ns[-1]:
-            continue
+    stamps = lane.frames.stamps_ns[::6]
+    for stamp_ns in stamps[stamps <= run.truth.stamps_ns[-1]].tolist():
         rows = zip(*true_objects(run, stamp_ns), strict=True)
         for landmark, range_m, azimuth_rad in rows:
             if 1.5 < range_m < 2.3 and abs(azimuth_rad) < 0.17:
                 off = CLICK_PIXELS_M * rng.standard_normal(2)
                 place = range_m + off[0], azimuth_rad + off[1] / range_m
-                given.append(
-                    Label(
-                        stamp_ns=stamp_ns,
-                        range_m=place[0],
-                        azimuth_rad=place[1],
-                        id=int(landmark),
-                    )
-                )
+                given.append((stamp_ns, *place, int(landmark)))
     found = lane_recognition.detections
     none = found.rows(1 - found.id_probability.sum(axis=1) > 0.5)
-    for stamp_ns, range_m, azimuth_rad in zip(
-        none.stamps_ns, none.range_m, none.azimuth_rad, strict=True
-    ):
+    places = zip(none.stamps_ns.tolist(), none.range_m, none.azimuth_rad, strict=True)
+    for stamp_ns, range_m, azimuth_rad in places:
         _, ranges_m, azimuths_rad = true_objects(run, stamp_ns)
-        if (
-            np.hypot(ranges_m - range_m, ranges_m * (azimuths_rad - azimuth_rad)).min()
-            > 0.5
-        ):
-            given.append(
-                Label(
-                    stamp_ns=int(stamp_ns),
-                    range_m=range_m,
-                    azimuth_rad=azimuth_rad,
-                    id=None,
-                )
-            )
-    return Labels(log=lane_log.name, labels=tuple(given))
+        across_m = ranges_m * (azimuths_rad - azimuth_rad)
+        if np.hypot(ranges_m - range_m, across_m).min() > 0.5:
+            given.append((stamp_ns, range_m, azimuth_rad, None))
+    names = ("stamp_ns", "range_m", "azimuth_rad", "id")
+    rows = [dict(zip(names, row, strict=True)) for row in given]
+    return Labels.model_validate({"log": lane_log.name, "labels": rows})
 
 
 def test_a_few_labels_measure_what_the_whole_truth_does(
@@ -102,29 +86,21 @@ def test_a_few_labels_measure_what_the_whole_truth_does(
 
 
 def test_labels_of_other_frames_designs_or_too_few_are_refused(lane, lane_log, clicks):
-    def refusal(*given: Label) -> str:
-        own = LabelledLog(
-            lane_log,
-            lane.sequence,
-            Labels(log="lane.mcap", labels=given),
-            Path("out.csv"),
-            "images",
-        )
+    def refusal(*given: Label, motion: str = "navigation") -> str:
+        labels = Labels(log="lane.mcap", labels=given)
+        own = LabelledLog(lane_log, lane.sequence, labels, Path("out.csv"), motion)
         with pytest.raises(CalibrationError) as refused:
             calibrate_by_labels([own])
         assert str(refused.value).startswith("out.csv: ")
         return str(refused.value)
 
     first = clicks.labels[0]
-    assert "name landmark 17, the designs are 1, 2, 3, 4" in refusal(
-        first.model_copy(update={"id": 17})
-    )
     assert "no frame of lane.mcap has the stamp of any label" in refusal(
         first.model_copy(update={"stamp_ns": 5})
     )
     far = first.model_copy(update={"range_m": 9.0})
     unnamed = first.model_copy(update={"id": None})
-    said = refusal(far, first, unnamed)
+    said = refusal(far, first, unnamed, motion="images")
     assert "2 of 3 labels met a track of the recogniser; row 1: outside of the" in said
     assert "; rows 2, 3: contradicts other labels of its track, so left out" in said
     assert "label more with `sonar-graph label`" in said

@@ -2,8 +2,10 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.recognition import (
     DrawnFrame,
     Recognition,
@@ -11,6 +13,7 @@ from sonar_graph.recognition import (
     write_recognition,
 )
 from sonar_graph.recognition.recognition_record import CANDIDATE_OFF_FLOOR
+from sonar_graph.states import LandmarkMap
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 
@@ -73,39 +76,54 @@ def test_nothing_of_an_earlier_recognition_is_left(
     assert read_recognition(tmp_path) is None
 
 
-@pytest.mark.parametrize(
-    ("unlike", "is_doubted"),
-    [((6, 10), True), ((5, 10), False), ((9, 9), False), ((0, 0), False)],
-)
-def test_a_floor_of_another_roughness_is_named(recognition, unlike, is_doubted):
-    lines = [
-        line
-        for line in replace(recognition, unlike=unlike).naming()
-        if "rougher or smoother" in line
-    ]
-    assert len(lines) == is_doubted
-    assert all(line.startswith("Warning: 6 of 10 tracks") for line in lines)
+def of_tracks(count: int, none: int) -> LandmarkDetections:
+    """A detection of each of some tracks, of which some are of no landmark."""
+    probability = np.full((count, 4), 0.25)
+    probability[:none] = 0.01
+    return LandmarkDetections(
+        stamps_ns=np.arange(count),
+        range_m=np.ones(count),
+        azimuth_rad=np.zeros(count),
+        range_azimuth_cov=np.tile(1e-4 * np.eye(2), (count, 1, 1)),
+        candidate_ids=np.tile([1, 2, 3, 4], (count, 1)),
+        id_probability=probability,
+        track=np.arange(count),
+    )
+
+
+def rejected(off_floor: int, others: int) -> Counter[str]:
+    return Counter(
+        {CANDIDATE_OFF_FLOOR: off_floor, "candidate rejected: too small": others}
+    )
 
 
 @pytest.mark.parametrize(
-    ("off", "other", "is_doubted"),
+    ("changes", "words", "start"),
     [
-        (60, 40, True),
-        (40, 60, False),
+        ({"unlike": (6, 10)}, "rougher or smoother", "6 of 10 tracks"),
+        ({"unlike": (5, 10)}, "rougher or smoother", None),
+        ({"unlike": (9, 9)}, "rougher or smoother", None),
+        ({"outcomes": rejected(60, 40)}, "no floor can be", "60 of 100 rejected"),
+        ({"outcomes": rejected(40, 60)}, "no floor can be", None),
+        ({"detections": of_tracks(20, 18)}, "may be unlike", "18 of 20 tracks are of"),
+        ({"detections": of_tracks(10, 10)}, "may be unlike", "10 of 10 tracks are of"),
+        ({"detections": of_tracks(20, 17)}, "may be unlike", None),
+        ({"detections": of_tracks(9, 9)}, "may be unlike", None),
     ],
 )
-def test_a_wrong_floor_is_doubted_if_most_candidates_lie_off_it(
-    recognition, off, other, is_doubted
+def test_doubtful_images_are_named_from_a_number_and_share_on(
+    recognition, changes, words, start
 ):
-    outcomes = Counter(
-        {CANDIDATE_OFF_FLOOR: off, "candidate rejected: too small": other}
+    doubted = replace(recognition, **changes).naming()
+    found = [line for line in doubted if words in line]
+    assert len(found) == (start is not None)
+    assert all(line.startswith(f"Warning: {start}") for line in found)
+
+
+def test_a_log_of_other_landmarks_is_the_reason_for_tracks_of_none(recognition):
+    others = LandmarkMap(
+        np.array([11, 12]), np.zeros((2, 3)), np.full((2, 3, 3), np.nan)
     )
-    lines = [
-        line
-        for line in replace(recognition, outcomes=outcomes).naming()
-        if "where no floor can be" in line
-    ]
-    assert len(lines) == is_doubted
-    assert all(
-        line.startswith("Warning: 60 of 100 rejected candidates") for line in lines
-    )
+    said = "\n".join(replace(recognition, detections=of_tracks(20, 20)).naming(others))
+    assert "the log has landmarks 11, 12, of which there is no design" in said
+    assert "may be unlike" not in said

@@ -9,7 +9,7 @@ import pytest
 from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs import read_log, write_log
+from sonar_graph.logs import write_log
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.recognition import (
     Recognition,
@@ -120,37 +120,12 @@ def test_a_lane_without_landmarks_yields_none(lane):
     assert found is None or not accepted(lane, found)
 
 
-def test_a_log_gives_what_its_images_give(lane, lane_log, lane_recognition):
-    counts = []
-    sequence = read_log(lane_log)
-    assert sequence.detections is None
-    result = recognise_images(lane_log, sequence, progress=counts.append)
-    assert counts == list(range(1, len(lane.frames) + 1))
-    assert (result.frames, result.outcomes) == (
-        len(lane.frames),
-        lane_recognition.outcomes,
-    )
-    for name in (
-        "stamps_ns",
-        "range_m",
-        "azimuth_rad",
-        "range_azimuth_cov",
-        "candidate_ids",
-        "id_probability",
-    ):
-        expected = getattr(lane_recognition.detections, name)
-        np.testing.assert_allclose(
-            getattr(result.detections, name), expected, atol=1e-4, err_msg=name
-        )
-
-
 def test_recognise_adds_the_detections_of_a_log_or_of_frames(lane, tmp_path):
     frames = first_frames(lane)
     expected = with_detections(lane.sequence, recognised(lane, frames))
     log = lane.write(tmp_path / "lane.mcap", frames)
     for found in (
         recognise(frames, lane.sequence),
-        recognise(log),
         recognise(str(log), topics={"sonar": TOPIC}),
     ):
         assert_same_detections(found.detections, expected.detections)
@@ -213,20 +188,11 @@ def assert_same_detections(
     np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-2)
 
 
-@pytest.mark.parametrize("is_from_log", [False, True], ids=["given", "in a log"])
 @pytest.mark.parametrize("reason", BAD)
-def test_a_bad_frame_is_named_in_a_warning_and_not_used(
-    lane, without, reason, is_from_log, tmp_path
-):
+def test_a_bad_frame_is_named_in_a_warning_and_not_used(lane, without, reason):
     frames = first_frames(lane)
     frames[AT] = bad = bad_frames(lane, AT)[reason]
-    if reason == "not finite":  # all frames of a log have one type of samples
-        frames = [replace(f, intensity=f.intensity.astype(np.float32)) for f in frames]
-    if is_from_log:
-        log = lane.write(tmp_path / "bad.mcap", frames)
-        result = recognise_images(log, read_log(log))
-    else:
-        result = recognised(lane, frames)
+    result = recognised(lane, frames)
     ((stamp_ns, warning),) = result.warnings
     assert stamp_ns == bad.stamps_ns[0]
     assert warning.startswith("frame not used: ")

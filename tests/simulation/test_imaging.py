@@ -37,21 +37,17 @@ def run() -> tuple[Sequence, list[ImagedFrames]]:
     return simulate_basin(options()), list(blocks())
 
 
-def test_asking_for_images_leaves_all_other_sensors_alone(
-    run,
-):
+def test_asking_for_images_leaves_all_other_sensors_alone(run):
     sequence = run[0]
     plain = simulate_basin(BasinOptions.model_validate(SLOW))
     assert sequence.detections is None
-    assert plain.detections is not None
     assert "image model" in sequence.notes["ours"]
-    np.testing.assert_array_equal(
-        sequence.imu.angular_velocity, plain.imu.angular_velocity
-    )
-    np.testing.assert_array_equal(sequence.dvl.velocity, plain.dvl.velocity)
-    np.testing.assert_array_equal(
-        sequence.true_landmarks.positions, plain.true_landmarks.positions
-    )
+    for one, other in (
+        (sequence.imu.angular_velocity, plain.imu.angular_velocity),
+        (sequence.dvl.velocity, plain.dvl.velocity),
+        (sequence.true_landmarks.positions, plain.true_landmarks.positions),
+    ):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_truth_of_frames_is_that_of_the_run(run):
@@ -106,16 +102,13 @@ def test_frames_stream_and_do_not_depend_on_the_size_of_blocks(run):
 
 
 def test_dropped_frames_are_missing_and_change_no_other():
-    whole = [b.frames for b in islice(blocks(drop_probability=0.0), 4)]
-    some = [b.frames for b in islice(blocks(drop_probability=0.3), 2)]
-    stamps_ns = np.concatenate([f.stamps_ns for f in whole])
-    kept_ns = np.concatenate([f.stamps_ns for f in some])
-    among = np.searchsorted(stamps_ns, kept_ns[kept_ns <= stamps_ns[-1]])
+    whole, more = (b.frames for b in islice(blocks(drop_probability=0.0), 2))
+    some = next(blocks(drop_probability=0.3)).frames
+    stamps_ns = np.append(whole.stamps_ns, more.stamps_ns)
+    among = np.searchsorted(stamps_ns, some.stamps_ns)
+    np.testing.assert_array_equal(stamps_ns[among], some.stamps_ns)
     assert 0.5 < len(among) / (among[-1] + 1) < 0.9
-    at = np.searchsorted(stamps_ns, some[0].stamps_ns[5])
-    np.testing.assert_array_equal(
-        some[0].intensity[5], whole[at // 16].intensity[at % 16]
-    )
+    np.testing.assert_array_equal(some.intensity[5], whole.intensity[among[5]])
 
 
 def test_time_offset_moves_stamps_and_sound_speed_scales_ranges(

@@ -59,24 +59,6 @@ def test_detections_fit_the_reference_and_err_at_their_rates():
     assert 0.4 < len(fewer.detections) / len(clean) < 0.6
 
 
-def test_what_was_recorded_stays_and_the_seed_decides():
-    run = add_landmarks(RECORDED)
-    assert all(
-        getattr(run, name) is getattr(RECORDED, name)
-        for name in ("imu", "dvl", "truth")
-    )
-    assert run.calibration.imu == RECORDED.calibration.imu
-    assert "simulated" in run.notes
-    first, again, other = (
-        add_landmarks(RECORDED, LandmarkOptions(seed=s, spacing_m=5.0))
-        for s in (1, 1, 2)
-    )
-    assert np.array_equal(first.detections.range_m, again.detections.range_m)
-    assert not np.array_equal(
-        first.true_landmarks.positions, other.true_landmarks.positions
-    )
-
-
 def test_what_cannot_be_done_is_said():
     with pytest.raises(SimulationError, match="no reference trajectory"):
         add_landmarks(replace(RECORDED, truth=None))

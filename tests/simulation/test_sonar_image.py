@@ -1,7 +1,6 @@
 """Simulated images obey the laws that real ones obey, each with its switch."""
 
 from copy import copy
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarImage
-from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import decibels
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -103,8 +101,8 @@ def test_speckle_is_exponential_in_intensity_and_spreads_by_5_57_decibels():
     assert stats.kstest(np.sqrt(relative), "expon").pvalue < 1e-6
 
 
-@pytest.mark.parametrize("shape", [1.0])
-def test_texture_makes_the_floor_k_distributed(shape: float):
+def test_texture_makes_the_floor_k_distributed():
+    shape = 1.0
     first, last = bins_at(simulator(), 1.9, 2.1)
     rough, even = (
         looks(30, texture_shape=s)[:, 20:76, first:last] for s in (shape, None)
@@ -182,8 +180,8 @@ def test_level_over_range_is_that_of_spreading_absorption_and_gain():
     )
 
 
-@pytest.mark.parametrize("height_m", [0.06])
-def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
+def test_shadow_is_as_long_as_height_and_grazing_angle_make_it():
+    height_m = 0.06
     near_m = 1.45
     far_m = 1.55
     made, open_ = (
@@ -200,57 +198,6 @@ def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
     assert (
         lit[(ranges_m > np.hypot(near_m + 0.11, HEIGHT_M)) & (ranges_m < end_m)].min()
         > 20
-    )
-
-
-def polar_picture(
-    design: LandmarkDesign, position: Floats, yaw_rad: float, made: FrameSimulator
-) -> np.ndarray:
-    """Beams and bins on which a point of a landmark's figure falls, by geometry alone."""
-    x, y = np.meshgrid(*2 * [np.linspace(-design.size_m / 2, design.size_m / 2, 600)])
-    foam = design.level_db(x, y) > 0
-    plane = Rotation.from_euler("Z", yaw_rad).apply(
-        np.column_stack([x[foam], y[foam], 0 * x[foam]])
-    )
-    q = TILT.inv().apply(position + plane - ABOVE)
-    azimuths = made.sonar.azimuths_rad()
-    ranges_m = made.ranges_m()
-    beam = np.abs(np.arctan2(q[:, 1], q[:, 0])[:, None] - azimuths).argmin(axis=1)
-    picture = np.zeros((len(azimuths), len(ranges_m)), bool)
-    picture[
-        beam,
-        np.searchsorted(
-            ranges_m + (ranges_m[1] - ranges_m[0]) / 2, np.linalg.norm(q, axis=1)
-        ),
-    ] = True
-    return picture
-
-
-@pytest.mark.parametrize("index", [1, 2])
-def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
-    design = DEFAULT_DESIGNS[index]
-    bearing = np.radians((-9.0, 4.0)[index % 2])
-    yaw_rad = 0.7
-    position = np.array([1.7 * np.cos(bearing), 1.7 * np.sin(bearing), 0.02])
-    flush = replace(design, height_m=0.0)  # the edge that faces the sonar would glint
-    made = simulator(
-        [scene.place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame"
-    )
-    mean_db = 10 * np.log10(
-        np.mean([intensity(made, number=n) for n in range(24)], axis=0)
-    )
-    seen = mean_db > 45
-    expected = polar_picture(design, position, yaw_rad, made)
-    assert np.sum(seen & expected) / np.sum(seen | expected) > 0.85
-    pixels = np.nonzero(seen), np.nonzero(expected)
-    one, other = (
-        [made.azimuths_rad()[beam].mean(), made.ranges_m()[bin_].mean()]
-        for beam, bin_ in pixels
-    )
-    assert np.abs(np.subtract(one, other)) == pytest.approx([0, 0], abs=0.002)
-    assert (
-        polar_picture(design, position, yaw_rad + 0.6, made)[seen].mean() < 0.97
-        or design.name == "disc"
     )
 
 
@@ -329,40 +276,11 @@ def test_an_echo_by_the_surface_has_delay_and_level_of_its_way():
     assert np.mean(20 * np.log10(late_m[on] / r[on])) > 2
 
 
-def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
-    told = simulator()
+def test_a_log_may_state_beams_that_are_equally_spaced():
+    """The true ones are compared with the lens of the recogniser in tests/sonar/test_geometry.py."""
     linear = simulator(measured_lens=False)
-    spacing_deg = np.degrees(np.diff(told.azimuths_rad()))
-    assert spacing_deg[47] == pytest.approx(0.368, abs=0.002)
-    assert spacing_deg[-1] == pytest.approx(0.21, abs=0.01)
-    # The published cubic, read the other way round: it counts from the left, with angles to the right.
-    deg = np.degrees(told.azimuths_rad())
-    beam = 1.012 * (-0.0030 * deg**3 - 0.0055 * deg**2 - 2.6829 * deg + 48.04) + 1
-    np.testing.assert_allclose(beam, np.arange(96, 0, -1), atol=1e-3)
     np.testing.assert_allclose(np.degrees(np.diff(linear.azimuths_rad())), 0.3)
-    assert np.abs(np.degrees(linear.azimuths_rad()) - deg).max() > 0.8
-    np.testing.assert_array_equal(level_db(told), level_db(linear))
-
-
-def test_a_seed_gives_the_same_bytes_and_only_noise_differs():
-    full = {
-        "texture_shape": 5.0,
-        "noise_db": 15.0,
-        "cross_talk_db": -25.0,
-        "multipath": True,
-        "joints": True,
-    }
-    one, again, other = (
-        simulator(seed=s, **full).frame(ABOVE, TILT, 5, 1.7) for s in (4, 4, 5)
-    )
-    np.testing.assert_array_equal(one, again)
-    assert np.mean(one != other) > 0.9
-    assert (one.dtype, one.shape) == (np.uint8, (96, 512))
-    for made, is_still in ((simulator(noise_db=15.0), False), (simulator(), True)):
-        assert (
-            np.array_equal(level_db(made, number=0), level_db(made, number=1))
-            == is_still
-        )
+    np.testing.assert_array_equal(level_db(simulator()), level_db(linear))
 
 
 @pytest.mark.parametrize("name", sorted(SONARS))
@@ -373,19 +291,11 @@ def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypa
     middle = image[sonar.beams // 2 - 5 : sonar.beams // 2 + 5, 250:350]
     # the mean of decibels: 2.5 below
     assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)
-    for span in (sonar.decibel_span, 64.0):
-        monkeypatch.setitem(
-            SONARS, name, sonar.model_copy(update={"decibel_span": span})
-        )
-        run = simulate_basin(
-            BasinOptions(duration_s=120.0, laps=1, image=ImageOptions(sonar=name))
-        )
-        said = run.calibration.sonar.image
-        assert (said.scale, said.decibel_span, said.full_scale) == (
-            "decibel",
-            span,
-            255,
-        )
+    other = sonar.model_copy(update={"decibel_span": 64.0})
+    monkeypatch.setitem(SONARS, name, other)
+    options = BasinOptions(duration_s=120.0, laps=1, image=ImageOptions(sonar=name))
+    said = simulate_basin(options).calibration.sonar.image
+    assert said == SonarImage(scale="decibel", decibel_span=64.0, full_scale=255)
 
 
 @pytest.mark.parametrize("span", [80.0, 100.0])

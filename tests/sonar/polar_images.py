@@ -4,9 +4,11 @@ from functools import cache
 
 import numpy as np
 
-from sonar_graph.devices import LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar import FloorView
+from sonar_graph.sonar import FloorView, confusion_for
+from sonar_graph.sonar.appearance import DesignFit
 from sonar_graph.sonar.regions import Candidates, CandidateVerdict
 
 RANGES_M = 1.26 + 1.25 / 512 * (np.arange(512) + 0.5)
@@ -29,6 +31,32 @@ def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> F
 
 ROTATION = level_R_sonar()
 VIEW = FloorView(ROTATION, HEIGHT_M)
+
+
+def frame(image: Floats, stamp_ns: int = 1) -> SonarFrames:
+    """A block of one frame."""
+    return SonarFrames(np.array([stamp_ns]), image[None], RANGES_M, AZIMUTHS_RAD)
+
+
+def odds(fit: DesignFit) -> Floats:
+    """Of each design against none of them, by one look and the weights that ship."""
+    return confusion_for(DEFAULT_DESIGNS).log_odds(fit.evidence)
+
+
+def design_of(
+    *boxes_m: tuple[float, float, float, float],
+    size_m: float = 0.5,
+    middle_m: tuple[float, float] = (0.0, 0.0),
+) -> LandmarkDesign:
+    """Bright boxes (x, y, half width, half height), moved so far from the middle of their square."""
+    places_m = np.arange(-size_m / 2 + 0.001, size_m / 2, 0.002)
+    y, x = np.meshgrid(-places_m, places_m, indexing="ij")
+    mask = np.full(x.shape, np.nan)
+    for x0, y0, half_x, half_y in boxes_m:
+        off_x = np.abs(x - x0 - middle_m[0])
+        off_y = np.abs(y - y0 - middle_m[1])
+        mask[(off_x <= half_x) & (off_y <= half_y)] = 12.0
+    return LandmarkDesign(7, "own", size_m, mask)
 
 
 def polar(xy_m: tuple[float, float]) -> tuple[float, float]:

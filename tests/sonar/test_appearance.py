@@ -8,7 +8,7 @@ import pytest
 
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar import EVIDENCE, Confusion, FloorView, confusion_for
+from sonar_graph.sonar import EVIDENCE, FloorView
 from sonar_graph.sonar.appearance import (
     Appearance,
     DesignFit,
@@ -26,16 +26,17 @@ from .polar_images import (
     RANGES_M,
     ROTATION,
     VIEW,
+    design_of,
     floor_points,
     image_db,
     level_R_sonar,
+    odds,
 )
 
 GRID = PolarGrid.of(RANGES_M, AZIMUTHS_RAD)
 
 
 BLUR_M = (0.002, 0.002)
-MODEL = confusion_for(DEFAULT_DESIGNS)
 
 
 @pytest.fixture(scope="module")
@@ -148,10 +149,6 @@ def test_every_design_is_known_at_every_heading_in_speckle(
     assert found[index] > 5
     assert np.delete(found, index).max() < found[index] - 10
     np.testing.assert_allclose(fit.centre_m[index], [1.7, 0.05], atol=0.008)
-
-
-def odds(fit: DesignFit, model: Confusion = MODEL) -> np.ndarray:
-    return model.log_odds(fit.evidence)
 
 
 def plain_evidence(
@@ -346,28 +343,24 @@ def test_a_plate_that_is_not_seen_is_no_evidence_against_a_design(appearance, de
     assert odds(unseen).max() > 0
 
 
-def drawn(figure: Floats, below_db: float | None = None) -> LandmarkDesign:
-    """A figure of 12 dB, and where it is not a level or the floor."""
-    return LandmarkDesign(
-        9,
-        "figure",
-        0.6,
-        np.where(figure, 12.0, np.nan if below_db is None else below_db),
-    )
+def drawn(figure: Floats) -> LandmarkDesign:
+    """A figure of 12 dB on the floor."""
+    return LandmarkDesign(9, "figure", 0.6, np.where(figure, 12.0, np.nan))
 
 
 def strangers() -> dict[str, LandmarkDesign | None]:
-    x, y = np.meshgrid(
-        0.002 * (np.arange(300) - 149.5), 0.002 * (149.5 - np.arange(300))
-    )
-    bar = (np.abs(y) < 0.04) & (np.abs(x) < 0.25)
+    places_m = 0.002 * (np.arange(300) - 149.5)
+    x, y = np.meshgrid(places_m, -places_m)
     small = np.hypot(x, y) < 0.09
     ragged = np.hypot(x, y) < 0.13 + 0.05 * np.cos(
         3 * np.arctan2(y, x)
     ) + 0.03 * np.cos(5 * np.arctan2(y, x) + 1)
     return {
-        "floor": None, "bar": drawn(bar), "a lid of another size": drawn(small), "ragged": drawn(ragged),
-    }  # fmt: skip
+        "floor": None,
+        "bar": design_of((0.0, 0.0, 0.25, 0.04), size_m=0.6),
+        "a lid of another size": drawn(small),
+        "ragged": drawn(ragged),
+    }
 
 
 @pytest.mark.parametrize("name", strangers())

@@ -51,22 +51,9 @@ def test_rules_are_their_equations_with_an_index_for_everything(seed: int):
     )
 
 
-@given(seeds)
-def test_evidence_is_bounded_and_the_order_of_frames_does_not_matter(seed: int):
-    """However many frames agree, the odds are at most those of a track that always looked so."""
-    log_odds = np.append(np.random.default_rng(seed).normal(0, 5, 2), 0.0)
+def test_endless_evidence_leaves_a_doubt_and_the_order_of_frames_none():
     birth = np.array([0.25, 0.25, 0.5])
-    n = np.array([1.0, 10.0, 1e9])
-    looks = 3.0
-    found = np.log(
-        bounded_evidence(birth, n[:, None] * log_odds, n, looks, 0.0) / birth
-    )
-    odds = found - found[:, -1:]
-    np.testing.assert_allclose(
-        odds[:, :2], (n / (n + looks))[:, None] * log_odds[:2], atol=1e-6
-    )
-    assert (abs(odds[:, :2]) <= abs(log_odds[:2]) + 1e-6).all()
-    sure = bounded_evidence(birth, np.array([[1e6, 0.0, 0.0]]), np.ones(1), looks, 0.01)
+    sure = bounded_evidence(birth, np.array([[1e6, 0.0, 0.0]]), np.ones(1), 3.0, 0.01)
     np.testing.assert_allclose(sure, [[0.9925, 0.0025, 0.005]])
     places = [(0, 0, 0), (0, 0.2, 0), (0, 0.4, 0)]
     other = np.array([[-1.0, 2.0, 0.0]])
@@ -125,28 +112,20 @@ def _association(before: list[int], after: list[int]) -> Association:
             for track in after
         ]
     )
-    n = len(after)
-    tracks = (
-        np.array(after),
-        np.tile([2.0, 0, 0], (n, 1)),
-        np.zeros((n, 3, 3)),
-        np.ones(n),
-        np.full(n, 5),
-    )
-    rows = matrix.reshape(n, len(before) + 1)
     none = np.array([], int)
+    unused = (none,) * 4
     return Association(
-        *tracks, 0, np.array(before, int), rows, np.zeros(n, int), none, ()
+        np.array(after), *unused, 0, np.array(before, int), matrix, none, none, ()
     )
 
 
 def _after(
-    places: list[tuple[float, float, float] | None],
+    places: list[tuple[float, float, float]],
     rule: str = "virtual-evidence",
     odds: list[np.ndarray] | None = None,
     **settings: float,
 ) -> list:
-    """Belief in landmark 1 after each frame of one track, looked at from these places; None: not looked at."""
+    """Belief in landmark 1 after each frame of one track, looked at from these places."""
     params = IdentityParams.model_validate({"rule": rule} | settings)
     beliefs = Beliefs(CONFUSION, params)
     before = []
@@ -154,15 +133,10 @@ def _after(
     for place, log_odds in zip(
         places, odds or [LOOKS_LIKE_1] * len(places), strict=True
     ):
-        looked = np.array([place is not None])
-        place = np.array(place or (0.0, 0.0, 0.0))
-        found.append(
-            float(
-                beliefs.step(
-                    _association(before, [7]), log_odds, looked, place, SIDEWAYS
-                )[0][0, 0]
-            )
-        )
+        now = _association(before, [7])
+        looked = np.array([True])
+        after, _ = beliefs.step(now, log_odds, looked, np.array(place), SIDEWAYS)
+        found.append(float(after[0, 0]))
         before = [7]
     return found
 

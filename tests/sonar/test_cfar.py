@@ -1,5 +1,7 @@
 """Laws of the candidate selection, of its background, and of the designs that can be candidates."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,7 +20,7 @@ from sonar_graph.sonar.regions import (
 )
 
 from . import polar_images
-from .polar_images import HEIGHT_M, RANGES_M, image_db, polar
+from .polar_images import HEIGHT_M, RANGES_M, design_of, image_db, polar
 
 AZIMUTHS_RAD = polar_images.AZIMUTHS_RAD[::-1].copy()
 VIEW = FloorView.from_angles(HEIGHT_M, 0.0, np.radians(30))
@@ -61,10 +63,6 @@ def shares_over(frames, **settings):
 
 
 def test_thresholds_are_those_of_speckle_of_one_look_and_of_many():
-    """-ln(0.01) = 4.605 times the mean is 6.63 dB, and the mean of decibels lies 2.51 dB below that of the power."""
-    assert cfar.false_alarm_offset_db(5.570, 0.01) == pytest.approx(
-        6.632 + 2.507, abs=0.01
-    )
     for looks in (1, 4, 20):
         levels = 10 * np.log10(stats.gamma(looks).rvs(1_000_000, random_state=4))
         offset = cfar.false_alarm_offset_db(float(np.std(levels)), 1e-2)
@@ -74,12 +72,6 @@ def test_thresholds_are_those_of_speckle_of_one_look_and_of_many():
     spreads = np.array([0.3, 1.23, 5.57, 8.0], dtype=np.float32)
     exact = [cfar.false_alarm_offset_db(float(spread), 1e-3) for spread in spreads]
     assert cfar.false_alarm_offsets_db(spreads, 1e-3) == pytest.approx(exact, abs=0.02)
-    cell_m = 1.885 * np.radians(0.3), 1.25 / 512
-    # beams and bins
-    assert [cfar.odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [
-        (3, 13),
-        (1, 1),
-    ]
 
 
 ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
@@ -226,21 +218,6 @@ def test_the_background_is_a_median_and_so_is_its_spread(nodes: int, shaded: flo
 
 PARAMS = cfar.DetectionParams()
 SEARCH_M = AppearanceParams().search_m
-PIXELS = 200
-
-
-def design_of(
-    *boxes_m: tuple[float, float, float, float],
-    level_db: float = 12.0,
-    size_m: float = 0.5,
-):
-    """Bright boxes of x and y from the middle, half width and half height."""
-    middles = ((np.arange(PIXELS) + 0.5) / PIXELS - 0.5) * size_m
-    y, x = np.meshgrid(-middles, middles, indexing="ij")
-    mask = np.full((PIXELS, PIXELS), np.nan)
-    for x0, y0, half_x, half_y in boxes_m:
-        mask[(np.abs(x - x0) <= half_x) & (np.abs(y - y0) <= half_y)] = level_db
-    return LandmarkDesign(1, "boxes", size_m, mask)
 
 
 def accepted_near_its_figure(design: LandmarkDesign) -> int:
@@ -261,39 +238,16 @@ def accepted_near_its_figure(design: LandmarkDesign) -> int:
     return int((away <= SEARCH_M).sum())
 
 
-SPECK = (0.0, 0.0, 0.02, 0.02)
 MIDDLE = (0.0, 0.0, 0.1, 0.1)
-ONE = design_of(MIDDLE)
-TWO_APART = design_of((-0.17, 0.0, 0.07, 0.07), (0.17, 0.0, 0.07, 0.07))
-AT_A_CORNER = design_of((0.15, 0.15, 0.08, 0.08))
-TINY = design_of(SPECK)
-APART = design_of((-0.2, 0.0, 0.1, 0.1), (0.2, 0.0, 0.06, 0.06), size_m=0.7)
-
-
-def set_to(**settings: float) -> cfar.DetectionParams:
-    return PARAMS.model_copy(update=settings)
-
-
-def is_refused(
-    design: LandmarkDesign, search_m: float = SEARCH_M, **settings: float
-) -> bool:
-    try:
-        cfar.check_candidates([design], set_to(**settings), search_m)
-    except CalibrationError as error:
-        return (
-            f"{design.name} (id {design.id}) would never be found: its bright parts are"
-            in str(error)
-        )
-    return False
+TINY = design_of((0.0, 0.0, 0.02, 0.02))
 
 
 @pytest.mark.parametrize(
     ("design", "count"),
     [
-        (ONE, 1),
         (design_of(MIDDLE, (0.2, 0.0, 0.02, 0.02)), 1),  # with a nose
-        (TWO_APART, 1),
-        (AT_A_CORNER, 1),
+        (design_of((-0.17, 0.0, 0.07, 0.07), (0.17, 0.0, 0.07, 0.07)), 1),
+        (design_of((0.15, 0.15, 0.08, 0.08)), 1),  # at a corner
         (TINY, 0),
         (design_of((0.0, 0.0, 0.24, 0.24)), 0),  # too large
     ],
@@ -302,16 +256,21 @@ def test_a_design_is_let_through_where_the_selection_finds_its_figure(
     design: LandmarkDesign, count: int
 ):
     assert accepted_near_its_figure(design) == count
-    assert is_refused(design) == (count == 0)
+    words = r"own \(id 7\) would never be found: its bright parts are"
+    refused = pytest.raises(CalibrationError, match=words)
+    with nullcontext() if count else refused:
+        cfar.check_candidates([design], PARAMS, SEARCH_M)
 
 
 def test_a_refusal_names_areas_distances_limits_and_settings():
+    apart = design_of((-0.2, 0.0, 0.1, 0.1), (0.2, 0.0, 0.06, 0.06), size_m=0.7)
+    small = cfar.DetectionParams(max_area_m2=0.03)
     with pytest.raises(
         CalibrationError,
         match=r" m² with its centre 40 cm .* within 4.5 cm of .*closing_m",
     ):
-        cfar.check_candidates([APART], set_to(max_area_m2=0.03), 0.045)
+        cfar.check_candidates([apart], small, 0.045)
     with pytest.raises(
         CalibrationError, match="its bright parts are all smoothed away; one must have"
     ):
-        cfar.check_candidates([TINY], set_to(smoothing_m=0.1), SEARCH_M)
+        cfar.check_candidates([TINY], cfar.DetectionParams(smoothing_m=0.1), SEARCH_M)

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
@@ -26,7 +26,7 @@ from sonar_graph.sonar.appearance import (
 from sonar_graph.sonar.place import Grid, Lit, Relief
 from sonar_graph.sonar.templates import Patch, check_headings
 
-from .polar_images import candidates_at
+from .polar_images import candidates_at, design_of
 
 CELL_M = 0.015
 SIDE = 37
@@ -107,24 +107,6 @@ def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
     np.testing.assert_allclose(bound, expected, rtol=0.03)
 
 
-def drawn_at(
-    middle_m: tuple[float, float], *boxes_m: tuple[float, float, float, float]
-) -> LandmarkDesign:
-    """Bright boxes (x, y, half width, half height), moved so far from the middle of their square."""
-    y, x = np.meshgrid(
-        -0.002 * (np.arange(350) - 174.5),
-        0.002 * (np.arange(350) - 174.5),
-        indexing="ij",
-    )
-    mask = np.full(x.shape, np.nan)
-    for x0, y0, half_x, half_y in boxes_m:
-        mask[
-            (np.abs(x - x0 - middle_m[0]) <= half_x)
-            & (np.abs(y - y0 - middle_m[1]) <= half_y)
-        ] = 12.0
-    return LandmarkDesign(7, "own", 0.7, mask)
-
-
 AN_L = (0.0, -0.12, 0.17, 0.05), (-0.12, 0.05, 0.05, 0.12)
 
 
@@ -133,7 +115,7 @@ def test_a_landmark_is_where_the_middle_of_its_square_is(
     middle_m,
 ):
     """In frames of the simulator, at several headings; the candidate lies where the figure does."""
-    design = drawn_at(middle_m, *AN_L)
+    design = design_of(*AN_L, size_m=0.7, middle_m=middle_m)
     sonar_m = np.array([0, 0, 0.95])
     tilt = Rotation.from_euler("Y", 0.52)
     model = confusion_for([design]).model_copy(update={"height_bias_m": 0.0})
@@ -174,15 +156,14 @@ def test_a_landmark_is_where_the_middle_of_its_square_is(
 
 
 def test_a_figure_beside_the_middle_that_looks_the_same_turned_is_refused():
+    aside = {"size_m": 0.7, "middle_m": (0.15, 0.0)}
     box = (0.0, 0.0, 0.08, 0.08)
-    check_headings(
-        [drawn_at((0.0, 0.0), box), drawn_at((0.15, 0.0), *AN_L), *DEFAULT_DESIGNS]
-    )
+    check_headings([design_of(box), design_of(*AN_L, **aside), *DEFAULT_DESIGNS])
     with pytest.raises(
         CalibrationError,
         match=r"own \(id 7\): its figure lies 15 cm .* looks the same .* in the middle",
     ):
-        check_headings([drawn_at((0.15, 0.0), box)])
+        check_headings([design_of(box, **aside)])
 
 
 @pytest.mark.parametrize("slope", [0.15, 0.6, 1.2])
@@ -193,17 +174,9 @@ def test_side_and_shadow_of_a_place_are_those_of_the_slope(slope: float, design:
     In the same appearance after each other, so that what was drawn for one slope is not taken for another.
     """
     relief_m = 0.012
-    heading_rad = 0.3
     tall = replace(DEFAULT_DESIGNS[design], relief_m=relief_m)
     appearance = Appearance([tall], BLUR_M)
-    rows = np.flatnonzero(appearance.templates.design == 0)
-    row = rows[
-        np.abs(
-            np.angle(
-                np.exp(1j * (appearance.templates.heading_rad[rows] - heading_rad))
-            )
-        ).argmin()
-    ]
+    row = len(appearance.templates.heading_rad) // 3
     heading_rad = float(appearance.templates.heading_rad[row])
     side = appearance.templates.side
     cell_m = CELL_M

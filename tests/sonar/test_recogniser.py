@@ -1,7 +1,5 @@
 """Laws of the whole recogniser, on small images of designs."""
 
-from collections import Counter
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -24,11 +22,10 @@ from sonar_graph.sonar import (
     SonarStep,
     confusion_for,
 )
-from sonar_graph.sonar import recogniser as module
 from sonar_graph.sonar.cfar import DetectionParams
-from sonar_graph.sonar.recogniser import each_once
+from sonar_graph.sonar.recogniser import NOT_INDEPENDENT, each_once
 
-from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, image_db, polar
+from .polar_images import AZIMUTHS_RAD, RANGES_M, ROTATION, VIEW, frame, image_db
 
 DECIBELS = Calibration(
     sonar=SonarCalibration(image=SonarImage(decibel_span=80.0, full_scale=80.0))
@@ -50,68 +47,30 @@ def picture(
     )
 
 
-def frame(number: int, image: Floats) -> SonarFrames:
-    return SonarFrames(
-        np.array([number * FRAME_NS]), image[None], RANGES_M, AZIMUTHS_RAD
-    )
-
-
-def moved(
-    ahead_m: float = 0.0, left_m: float = 0.0, turned: gtsam.Rot3 | None = None
-) -> SonarStep:
-    """Level: in the axes of a sonar that is tilted about its y axis, left is along y."""
-    return SonarStep(
-        gtsam.Pose3(turned or gtsam.Rot3(), np.array([ahead_m, left_m, 0.0])),
-        COVARIANCE,
-    )
-
-
-def aside(metres: float, number: int = 1) -> SonarStep | None:
-    """To the left, but for the first frame."""
-    return moved(left_m=metres) if number else None
+def look(
+    recogniser: Recogniser, number: int, image: Floats, left_m: float
+) -> RecognisedFrame:
+    """Result of a frame after a move to the left: along y, as the sonar is tilted about that axis."""
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, left_m, 0.0]))
+    step = SonarStep(pose, COVARIANCE) if number else None
+    return recogniser.process(frame(image, number * FRAME_NS), step, VIEW)
 
 
 def pass_by(
-    recogniser: Recogniser, design: int | None, frames: int = 9, step_m: float = 0.05
-) -> list:
-    """Detections of frames in which the sonar moves to the left past something straight ahead."""
+    recogniser: Recogniser, frames: int = 9, step_m: float = 0.05
+) -> list[RecognisedFrame]:
+    """Results of frames in which the sonar moves to the left past a square straight ahead."""
     places = [(k, round((frames // 2 - k) * step_m, 6)) for k in range(frames)]
     return [
-        recogniser.process(
-            frame(k, picture(design, 1.7, y, 0.4, k)), aside(step_m, k), VIEW
-        ).detections
-        for k, y in places
+        look(recogniser, k, picture(SQUARE, 1.7, y, 0.4, k), step_m) for k, y in places
     ]
-
-
-@pytest.mark.parametrize("design", [DISC, SQUARE, TRIANGLE, CROSS])
-def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int):
-    # as these pictures show them
-    flush = [replace(one, relief_m=0.0) for one in DEFAULT_DESIGNS]
-    last = pass_by(Recogniser(DECIBELS, flush, EVERY), design)[-1]
-    assert last.candidate_ids.tolist() == [[1, 2, 3, 4]]
-    ids, probability = last.most_probable()
-    assert ids.tolist() == [design + 1]
-    assert probability[0] > 0.9
-    assert last.id_probability.sum() <= 1 + 1e-12
-    r, a = polar((1.7, -0.2))
-    errors = np.array([last.range_m[0] - r, last.azimuth_rad[0] - a])
-    # 0.999 of chi2 with two degrees
-    assert errors @ np.linalg.solve(last.range_azimuth_cov[0], errors) < 13.8
-    assert np.abs(errors) == pytest.approx([0, 0], abs=0.015)
-    assert last.stamps_ns.tolist() == [8 * FRAME_NS]
 
 
 def standing(
     recogniser: Recogniser, frames: range, design: int | None = SQUARE, y_m: float = 0.0
 ) -> list:
     """Results of frames from one place."""
-    return [
-        recogniser.process(
-            frame(k, picture(design, 1.7, y_m, 0.4, k)), aside(0.0, k), VIEW
-        )
-        for k in frames
-    ]
+    return [look(recogniser, k, picture(design, 1.7, y_m, 0.4, k), 0.0) for k in frames]
 
 
 def outcomes_of_tracks(result: RecognisedFrame) -> list[str]:
@@ -164,33 +123,6 @@ def test_a_track_ends_with_a_row_and_the_next_has_another_number():
     assert tracks[0][0] > 0
 
 
-def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same():
-    """Patches are compared in that plane where no floor is known."""
-    scale = Calibration(
-        sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8))
-    )
-    recognisers = tuple(
-        Recogniser(of, params=EVERY) for of in (DECIBELS, scale, DECIBELS)
-    )
-    for k in range(4):
-        image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
-        given = (
-            (image, VIEW),
-            ((1e3 * 10 ** (image / 20)).astype(np.float32), VIEW),
-            (image, None),
-        )
-        found = [
-            r.process(frame(k, im), aside(0.0, k), v).detections
-            for r, (im, v) in zip(recognisers, given, strict=True)
-        ]
-    plain, linear, flat = ((one.range_m, one.azimuth_rad) for one in found)
-    np.testing.assert_allclose(linear, plain, atol=1e-4)
-    np.testing.assert_allclose(
-        found[1].id_probability, found[0].id_probability, atol=0.01
-    )
-    np.testing.assert_allclose(flat, plain, atol=0.04)
-
-
 def test_other_designs_and_blocks_of_more_frames_are_refused():
     model = RecogniserParams(confusion=confusion_for(DEFAULT_DESIGNS[:2]))
     with pytest.raises(
@@ -210,37 +142,39 @@ def test_other_designs_and_blocks_of_more_frames_are_refused():
         )
 
 
-def test_a_bad_frame_has_no_sighting_and_its_motion_counts_once():
-    good = Recogniser(DECIBELS, params=EVERY)
-    bad = Recogniser(DECIBELS, params=EVERY)
+def test_linear_samples_give_nearly_the_same():
+    image_of = SonarImage(scale="linear", full_scale=1e8)
+    scale = Calibration(sonar=SonarCalibration(image=image_of))
+    plain, linear = (Recogniser(of, params=EVERY) for of in (DECIBELS, scale))
+    for k in range(4):
+        image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
+        expected = look(plain, k, image, 0.0).detections
+        samples = (1e3 * 10 ** (image / 20)).astype(np.float32)
+        found = look(linear, k, samples, 0.0).detections
+    np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
+    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=0.01)
+
+
+def test_the_motion_over_a_bad_frame_counts_once():
+    good, bad = (Recogniser(DECIBELS, params=EVERY) for _ in range(2))
     for recogniser in (good, bad):
-        pass_by(recogniser, SQUARE, 5)
-    result = bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW)
-    assert (result.is_used, result.detections, result.tracks) == (False, None, ())
-    assert [fate[:2] for fate in result.fates] == [(5 * FRAME_NS, -1)]
-    assert result.fates[0].is_of_frame
-    assert result.fates[0].outcome == "frame not used: all samples are zero"
-    last = frame(6, picture(SQUARE, 1.7, -0.15, 0.4, 6))
-    expected = good.process(last, aside(0.05), VIEW)
-    found = bad.process(last, aside(-0.3), VIEW)
-    np.testing.assert_allclose(found.detections.range_m, expected.detections.range_m)
-    np.testing.assert_allclose(
-        found.detections.id_probability, expected.detections.id_probability, atol=1e-6
-    )
-    assert [f.track for f in found.fates if f.track >= 0] == [
-        f.track for f in expected.fates if f.track >= 0
-    ]
+        pass_by(recogniser, 5)
+    assert not look(bad, 5, np.zeros((96, 512), np.float32), 0.35).is_used
+    last = picture(SQUARE, 1.7, -0.15, 0.4, 6)
+    expected = look(good, 6, last, 0.05).detections
+    found = look(bad, 6, last, -0.3).detections
+    assert found.track.tolist() == expected.track.tolist()
+    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
 
 
 def test_a_sonar_that_comes_to_rest_keeps_its_belief():
     """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
     recogniser = Recogniser(DECIBELS, params=EVERY)
     image = picture(SQUARE, 1.7, -0.2, 0.4, 8)
-    before = pass_by(recogniser, SQUARE)[-1]
+    before = pass_by(recogniser)[-1].detections
     for k in range(60):
-        found = recogniser.process(
-            frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW
-        ).detections
+        again = image + np.float32(1e-3 * (k % 2))
+        found = look(recogniser, 9 + k, again, 0.0).detections
     assert before.id_probability[0, SQUARE] > 0.9
     np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
 
@@ -252,9 +186,7 @@ def test_two_discs_at_once_are_not_both_the_disc():
         y_m = round(0.2 - 0.05 * k, 6)
         left = picture(DISC, 1.7, y_m + 0.2, 0.4, k)
         right = picture(DISC, 1.75, y_m - 0.2, 0.4, k)
-        found = recogniser.process(
-            frame(k, np.maximum(left, right)), aside(0.05, k), VIEW
-        ).detections
+        found = look(recogniser, k, np.maximum(left, right), 0.05).detections
         if found is not None and len(found) == 2:
             pair = found.id_probability
             assert pair.argmax(axis=1)[pair.max(axis=1) > 0.5].tolist() in ([], [DISC])
@@ -282,15 +214,17 @@ def test_a_track_is_reported_as_often_as_its_errors_are_independent():
     # one frame in four
     model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"report_interval_s": 0.8})
     named = {}
+    outcomes = {}
     for independent in (True, False):
         recogniser = Recogniser(
             DECIBELS, params=RecogniserParams(confusion=model, independent=independent)
         )
-        found = pass_by(recogniser, SQUARE, frames=15, step_m=0.02)
+        found = pass_by(recogniser, frames=15, step_m=0.02)
+        outcomes[independent] = [o for one in found for o in outcomes_of_tracks(one)]
         named[independent] = {
-            k: int(one.most_probable()[0][0])
+            k: int(one.detections.most_probable()[0][0])
             for k, one in enumerate(found)
-            if one is not None
+            if one.detections is not None
         }
     assert len(named[False]) == 13, "from the third frame on"
     reports = sorted(named[True])
@@ -299,18 +233,5 @@ def test_a_track_is_reported_as_often_as_its_errors_are_independent():
     for before, now in pairwise(reports):
         assert now - before == 4 or named[True][before] != named[True][now]
     assert len(reports) <= 2 + len(believed) // 4 + int(np.sum(np.diff(believed) != 0))
-    assert recogniser_said(model)[module.NOT_INDEPENDENT] == len(named[False]) - len(
-        reports
-    )
-
-
-def recogniser_said(model) -> Counter:
-    recogniser = Recogniser(DECIBELS, params=RecogniserParams(confusion=model))
-    said = Counter()
-    for k in range(15):
-        y = round((15 // 2 - k) * 0.02, 6)
-        result = recogniser.process(
-            frame(k, picture(SQUARE, 1.7, y, 0.4, k)), aside(0.02, k), VIEW
-        )
-        said.update(outcomes_of_tracks(result))
-    return said
+    too_soon = outcomes[True].count(NOT_INDEPENDENT)
+    assert too_soon == len(named[False]) - len(reports)

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from sonar_graph.devices import DEFAULT_DESIGNS
-from sonar_graph.images import SonarFrames
 from sonar_graph.measurements import Floats
 from sonar_graph.sonar import Confusion, FloorView, ObjectSighting, confusion_for
 from sonar_graph.sonar.appearance import (
     CENTROID_SIGMA_M,
     AppearanceParams,
     CandidateFit,
-    DesignFit,
 )
 
 from .polar_images import (
@@ -23,7 +21,9 @@ from .polar_images import (
     ROTATION,
     VIEW,
     candidates_at,
+    frame,
     image_db,
+    odds,
     polar,
 )
 
@@ -38,17 +38,6 @@ MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(update=SETTINGS)
 TRIANGLE = 2
 FLUSH = [replace(design, relief_m=0.0) for design in DEFAULT_DESIGNS]
 """As these images show them: what stands up has a bright side and a shadow."""
-
-
-def odds(fit: DesignFit, model: Confusion = MODEL) -> Floats:
-    """Of each design against none of them, by one look."""
-    return model.log_odds(fit.evidence)
-
-
-def frame(
-    image: Floats, ranges_m: Floats = RANGES_M, azimuths_rad: Floats = AZIMUTHS_RAD
-) -> SonarFrames:
-    return SonarFrames(np.array([1]), image[None], ranges_m, azimuths_rad)
 
 
 def look_at(

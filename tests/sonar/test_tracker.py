@@ -80,13 +80,9 @@ def test_the_association_is_a_distribution_whatever_the_order(counts, seed, is_c
         assert len(set(numbers)) == len(numbers)  # numbers are not used twice
         taken = found.candidate[found.candidate >= 0]
         assert len(np.unique(taken)) == len(taken)  # one candidate serves one track
-    one, other = (
-        (found.position_m[order], found.existence[order], found.matrix[order, -1])
-        for found in pairs[-1]
-        for order in [np.argsort(found.position_m[:, 1])]
-    )
-    for left, right in zip(one, other, strict=True):
-        assert np.allclose(left, right)
+    for name in ("position_m", "existence"):
+        one, other = (np.sort(getattr(found, name), axis=0) for found in pairs[-1])
+        assert np.allclose(one, other)
 
 
 def test_association_and_existence_are_ratios_of_densities_by_hand():

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.numerics import compiled
-from sonar_graph.simulation.sonar_image.scene import Floats32
+from sonar_graph.numerics import compiled, inlined
+from sonar_graph.simulation.sonar_image.scene import Floats32, Scatterers
 
 TAPS = 6
 """Bins that one echo reaches."""
@@ -67,13 +67,6 @@ class SonarPlacement(NamedTuple):
     """Added to row and column of the amplitudes: (0, 0) where speckle belongs to the world."""
 
 
-class Floor(NamedTuple):
-    """Scatterers of the bare floor, as `Scatterers` has them."""
-
-    points: Floats32
-    texture: Floats32
-
-
 class Surface(NamedTuple):
     """Objects in view, cell by cell; arrays without a row where there is only floor."""
 
@@ -94,6 +87,17 @@ class Horizon(NamedTuple):
     """Size of a step."""
 
 
+@inlined
+def sight(
+    view: SonarPlacement, horizon: Horizon, x: float, y: float
+) -> tuple[float, float, int]:
+    """Distance ahead of the sonar and from it along the floor, and number of the bearing, of a place."""
+    ahead = view.heading[0] * x + view.heading[1] * y
+    aside = view.heading[0] * y - view.heading[1] * x
+    share = (aside / ahead / horizon.half_tangent + 1.0) * 0.5
+    return ahead, np.sqrt(x * x + y * y), int(share * len(horizon.tangent))
+
+
 @compiled
 def block_rays(
     view: SonarPlacement,
@@ -112,10 +116,7 @@ def block_rays(
             if relief < raised_m:
                 continue
             x = (surface.first_column + column + 0.5) * cell_m - view.position_m[0]
-            ahead = view.heading[0] * x + view.heading[1] * y
-            aside = view.heading[0] * y - view.heading[1] * x
-            run = np.sqrt(x * x + y * y)
-            bearing = int((aside / ahead / horizon.half_tangent + 1.0) * 0.5 * bearings)
+            ahead, run, bearing = sight(view, horizon, x, y)
             distance = int(run / horizon.distance_m)
             if ahead > 0 and 0 <= bearing < bearings and distance < distances:
                 rise = (view.floor_z_m + relief - view.position_m[2]) / run
@@ -165,10 +166,7 @@ def is_blocked(
 ) -> bool:
     """True where something nearer hides a point from the sonar."""
     bearings, distances = horizon.tangent.shape
-    ahead = view.heading[0] * x + view.heading[1] * y
-    aside = view.heading[0] * y - view.heading[1] * x
-    run = np.sqrt(x * x + y * y)
-    bearing = int((aside / ahead / horizon.half_tangent + 1.0) * 0.5 * bearings)
+    _, run, bearing = sight(view, horizon, x, y)
     # one step nearer: a cell must not shade itself
     distance = int(run / horizon.distance_m) - 1
     if not 0 <= bearing < bearings or distance < 0:
@@ -218,7 +216,7 @@ def table_places(
 @compiled
 def sum_echoes(
     view: SonarPlacement,
-    floor: Floor,
+    floor: Scatterers,
     surface: Surface,
     horizon: Horizon,
     tables: Tables,
@@ -322,12 +320,8 @@ def through_beams(
                 )
 
 
-def no_surface() -> Surface:
-    """Surface without objects."""
-    none = np.empty((0, 0), np.float32)
-    return Surface(0, none, none)
-
-
-def no_horizon() -> Horizon:
-    """Horizon without shadows."""
-    return Horizon(np.empty((0, 0), np.float32), 1.0, 1.0)
+NONE = np.empty((0, 0), np.float32)
+NO_SURFACE = Surface(0, NONE, NONE)
+"""Without objects."""
+NO_HORIZON = Horizon(NONE, 1.0, 1.0)
+"""Without shadows."""

@@ -239,8 +239,8 @@ class FrameSimulator:
                 cells.spans,
                 shift,
             )
-            surface = echoes.no_surface()
-            horizon = echoes.no_horizon()
+            surface = echoes.NO_SURFACE
+            horizon = echoes.NO_HORIZON
             near = within(
                 self.objects,
                 position_m,
@@ -265,10 +265,9 @@ class FrameSimulator:
             reflection = (
                 self.options.floor_reflection if self.options.multipath else 0.0
             )
-            floor = echoes.Floor(self._floor.points, self._floor.texture)
             echoes.sum_echoes(
                 view,
-                floor,
+                self._floor,
                 surface,
                 horizon,
                 tables,
@@ -361,7 +360,7 @@ def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
 
 
 def laid_out(
-    objects: Sequence[SeabedObject], cells: Cells, ripples_m: Floats32 | None
+    objects: Sequence[SeabedObject], cells: Cells, ripples_m: Floats32
 ) -> Surface:
     """Objects and ripples on the cells in view; the later of two objects covers the earlier.
 
@@ -372,7 +371,7 @@ def laid_out(
     shape = len(cells.spans), end_column - first_column
     amplitude = np.full(shape, np.nan, np.float32)
     relief_m = np.zeros(shape, np.float32)
-    if ripples_m is not None:
+    if len(ripples_m):
         rows = cells.first_row + np.arange(shape[0])
         columns = first_column + np.arange(shape[1])
         relief_m = ripples_m[np.ix_(rows % CELLS, columns % CELLS)]

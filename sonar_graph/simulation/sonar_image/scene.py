@@ -32,16 +32,15 @@ JOINT_WIDTH_M = 0.008
 JOINT_DB = 6.0
 
 
-@dataclass(frozen=True, eq=False)
-class Scatterers:
+class Scatterers(NamedTuple):
     """One period of the floor: cell (row i, column j) covers y from 3.2 mm · i and x from 3.2 mm · j on."""
 
     points: Floats32
     """Real and imaginary part of the amplitude, then x and y within the cell as shares of it; (1250, 1250, 4)."""
     texture: Floats32
     """Amplitude of the bare floor, mean square 1 but for joints, shape (1250, 1250)."""
-    relief_m: Floats32 | None
-    """Height over the even floor, at most 0, shape (1250, 1250); None: even."""
+    relief_m: Floats32
+    """Height over the even floor, at most 0, shape (1250, 1250); without a row: even."""
 
 
 def smooth_field(length_m: float, rng: np.random.Generator) -> Floats:
@@ -115,13 +114,11 @@ def scatterers(
         on_line = (middle_m + JOINT_WIDTH_M / 2) % JOINT_SPACING_M < JOINT_WIDTH_M
         on_joint = on_line[:, None] | on_line[None, :]
         strength = np.where(on_joint, strength * 10 ** (JOINT_DB / 10), strength)
-    is_even = ripple_height_m == 0
-    relief_m = (
-        None
-        if is_even
-        else ripples(ripple_length_m, ripple_height_m, ripple_rng).astype(np.float32)
-    )
-    return Scatterers(points, np.sqrt(strength).astype(np.float32), relief_m)
+    relief_m = np.empty((0, 0))
+    if ripple_height_m > 0:
+        relief_m = ripples(ripple_length_m, ripple_height_m, ripple_rng)
+    texture = np.sqrt(strength).astype(np.float32)
+    return Scatterers(points, texture, relief_m.astype(np.float32))
 
 
 Shape = Callable[[Floats, Floats], tuple[Floats, Floats]]

@@ -4,7 +4,7 @@ Sizes are those of landmarks (0.1 to 0.4 m), levels and heights what such things
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -26,12 +26,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 
 
-class Drawn(NamedTuple):
-    """One object of a kind."""
-
-    shape: Shape
-    extent_m: float
-    """Radius of the disc that its material covers."""
+Drawn = tuple[Shape, float]
+"""One object of a kind: its shape, and the radius of the disc that its material covers."""
 
 
 def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> Shape:
@@ -144,55 +140,49 @@ def _tuft(rng: np.random.Generator) -> Drawn:
         int(rng.integers(10, 24)),
         rng,
     )
-    return Drawn(shape, 1.2 * radius_m)
+    return shape, 1.2 * radius_m
 
 
 def _boulder(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.08, 0.17)
-    return Drawn(
-        boulder(radius_m, rng.uniform(0.03, 0.09), rng.uniform(4, 11), rng),
-        1.4 * radius_m,
-    )
+    height_m = rng.uniform(0.03, 0.09)
+    return boulder(radius_m, height_m, rng.uniform(4, 11), rng), 1.4 * radius_m
 
 
 def _stick(rng: np.random.Generator) -> Drawn:
     length_m = rng.uniform(0.3, 0.5)
     width_m = rng.uniform(0.015, 0.04)
-    return Drawn(
-        block(length_m, width_m, 0.8 * width_m, rng.uniform(4, 10)), length_m / 2
-    )
+    return block(length_m, width_m, 0.8 * width_m, rng.uniform(4, 10)), length_m / 2
 
 
 def _lid(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.11, 0.16)
-    return Drawn(polygon(radius_m, 48, 0.012, rng.uniform(8, 12)), radius_m)
+    return polygon(radius_m, 48, 0.012, rng.uniform(8, 12)), radius_m
 
 
 def _tile(rng: np.random.Generator) -> Drawn:
     side_m = rng.uniform(0.2, 0.3)
-    return Drawn(block(side_m, side_m, 0.01, rng.uniform(6, 12)), side_m / np.sqrt(2))
+    return block(side_m, side_m, 0.01, rng.uniform(6, 12)), side_m / np.sqrt(2)
 
 
 def _hexagon(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.13, 0.17)
-    return Drawn(polygon(radius_m, 6, 0.013, rng.uniform(8, 12)), radius_m)
+    return polygon(radius_m, 6, 0.013, rng.uniform(8, 12)), radius_m
 
 
 def _pan_lid(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.11, 0.15)
-    return Drawn(
-        rimmed_disc(radius_m, 0.012, 0.01, rng.uniform(0.015, 0.03), 0.02), radius_m
-    )
+    return rimmed_disc(radius_m, 0.012, 0.01, rng.uniform(0.015, 0.03), 0.02), radius_m
 
 
 def _box(rng: np.random.Generator) -> Drawn:
     side_m = rng.uniform(0.2, 0.28)
-    return Drawn(block(side_m, side_m, 0.05, rng.uniform(4, 10)), side_m / np.sqrt(2))
+    return block(side_m, side_m, 0.05, rng.uniform(4, 10)), side_m / np.sqrt(2)
 
 
 def _round_stone(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.11, 0.15)
-    return Drawn(stone(radius_m, rng.uniform(0.03, 0.06), rng.uniform(6, 11)), radius_m)
+    return stone(radius_m, rng.uniform(0.03, 0.06), rng.uniform(6, 11)), radius_m
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
@@ -234,14 +224,6 @@ def strangers_at(
         zip(spots_m, (kinds[k] for k in order), strict=False)
     ):
         drawn = KINDS[kind](rng)
-        objects.append(
-            place(
-                first_id - number,
-                kind,
-                drawn.shape,
-                drawn.extent_m,
-                spot,
-                rng.uniform(-np.pi, np.pi),
-            )
-        )
+        yaw_rad = rng.uniform(-np.pi, np.pi)
+        objects.append(place(first_id - number, kind, *drawn, spot, yaw_rad))
     return objects
