@@ -157,6 +157,8 @@ CERTAIN_SIGMAS = 4.0
 PAIRED_SIGMAS = 2.0
 LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
+LEAST_SHARE_OF_DELAY = 0.5
+"""Share of a late IMU's delay that sightings and fixes show at least."""
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 BACKWARDS = -np.eye(3)
@@ -393,7 +395,12 @@ def by_late_imu(
         return of_dvl, by_motion
     for delay in delays:
         together = delay.estimate.minus(-late.estimate.value)
-        if matters(together, LEAST_TOGETHER_S, late.estimate.sigma):
+        is_apart = matters(together, LEAST_TOGETHER_S, late.estimate.sigma)
+        # all but headings are compared with a path of the Doppler log, which is in time, along the late turns
+        is_between = (
+            LEAST_SHARE_OF_DELAY < -delay.estimate.value / late.estimate.value < 1.0
+        )
+        if is_apart and (delay.quantity.startswith(HEADING.name) or not is_between):
             return of_dvl, by_motion
     names = " and ".join(delay.quantity.partition(" against")[0] for delay in delays)
     of_imu = replace(
