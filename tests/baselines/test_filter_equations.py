@@ -363,6 +363,23 @@ def test_an_update_by_a_point_seen_far_off_is_the_textbook_s(
     assert_corrected(filter_, slam, world, P, H, H_m @ C @ H_m.T + G_z @ V @ G_z.T, e)
 
 
+def test_the_bias_walks_where_there_is_one():
+    slam = begun(Invariant, world_at(ANGLES))
+    motion = motion_of(np.zeros(6), np.zeros((6, 6)))
+    duration_s = 4.0
+    before = slam.state()[1].P
+    walks = (
+        [CALIBRATION.imu.gyro_bias_walk_density] * 6
+        + [CALIBRATION.imu.accel_bias_walk_density] * 3
+        + [0.0] * 2
+    )
+    predict(slam, motion._replace(D=np.zeros((6, 3))), duration_s)
+    walked = np.diag(
+        [0.0] * 3 + [density**2 * duration_s for density in walks] + [0.0] * 9
+    )
+    assert_allclose(slam.state()[1].P - before, walked, atol=1e-15)
+
+
 def gauge(axes):
     """Moves of the whole world along x and y (and z), and its turn about the vertical, as columns of xi."""
     N = np.zeros((23, axes + 1))
