@@ -323,9 +323,8 @@ def test_rows_recorded_late_are_placed_by_their_stamps_and_named(straight, tmp_p
             writer.add_metadata(record.name, record.metadata)
         for schema, channel, message in reader.iter_messages():
             counts[channel.topic] += 1
-            is_late = counts[channel.topic] % 10 == 0 and channel.topic.endswith(
-                ("imu", "dvl")
-            )
+            is_moved = any(sensor in channel.topic for sensor in ("imu", "dvl"))
+            is_late = is_moved and counts[channel.topic] % 10 == 0
             at_ns = message.log_time + 350_000_000 * is_late
             messages.append((at_ns, schema, channel, message.data))
         channels: dict[int, int] = {}
