@@ -2,12 +2,12 @@
 
 # fmt: off
 from sonar_graph.evaluation.comparison import LIBRARIES, compare, describe_environment, judge
-from sonar_graph.evaluation.consistency import GATED_SHARE, anees_interval, likeness, nis, normalised_squares
+from sonar_graph.evaluation.consistency import (GATED_SHARE, anees_interval, likeness, nis, normalised_squares,
+    used_squares)
 from sonar_graph.evaluation.digits import fixed, format_value
 from sonar_graph.evaluation.metrics import landmark_errors, rmse, scored_map, yaw_rad
-from sonar_graph.evaluation.aligned import aligned_to_truth, own_map_errors
-from sonar_graph.evaluation.results import (MOST_ROWS_NAMED, Comparison, ErrorSeries, RefusedRows, RunResult, Score,
-    gathered)
+from sonar_graph.evaluation.aligned import aligned_to_truth
+from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, ErrorSeries, RunResult, Score, gathered
 from sonar_graph.evaluation.run import check_request, one_line, run_estimator, run_here
 from sonar_graph.evaluation.scored_instants import (DURATION_S, MAP_TIMES_S, map_instants, published_maps,
     repeats_published)
@@ -17,12 +17,12 @@ from sonar_graph.evaluation.tables import (FITTED, HEADLINES, HEIGHTS, LABELS, R
     label, run_columns, score_keys, score_table, unaligned)
 __all__ = [
     "Comparison", "DURATION_S", "ESTIMATES", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES",
-    "HEIGHTS", "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "RAW", "RefusedRows",
+    "HEIGHTS", "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "RAW",
     "RunResult", "SCORES", "Score", "aligned_to_truth", "anees_interval",
     "check_request", "compact_table", "compare", "describe_environment", "fixed",
     "format_value", "gathered", "headline_metric", "judge", "label", "landmark_errors", "likeness", "map_instants", "nis",
-    "normalised_squares", "one_line", "own_map_errors", "published_maps", "read_comparison",
+    "normalised_squares", "one_line", "published_maps", "read_comparison",
     "repeats_published", "result_names", "rmse", "run_columns", "run_estimator", "run_here",
-    "score_keys", "score_table", "scored_map", "unaligned", "write_comparison",
+    "score_keys", "score_table", "scored_map", "unaligned", "used_squares", "write_comparison",
     "write_viewer_files", "yaw_rad",
 ]

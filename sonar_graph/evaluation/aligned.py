@@ -12,17 +12,17 @@ A smoother moves its whole map when it learns, and the path that it gave before 
 errors of the path count that; this one does not. Derivation: docs/theory/metrics.md.
 """
 
-from collections.abc import Sequence as Many
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from sonar_graph.evaluation.consistency import world_position_covs
+from sonar_graph.evaluation.consistency import sigmas, world_position_covs
 from sonar_graph.evaluation.metrics import (
     Alignment,
     align_map,
     align_yaw,
+    in_both,
     scored_map,
     yaw_rad,
 )
@@ -35,6 +35,8 @@ from sonar_graph.states import LandmarkMap, Trajectory
 
 # fewer landmarks leave the rotation of a map open; the map then moves with the causal path
 LEAST_MATCHED = 2
+# true landmarks that a map must name for an error on it: of two, the errors alone would turn it
+LEAST_LANDMARKS = 3
 
 
 def aligned_to_truth(comparison: Comparison) -> Comparison | None:
@@ -69,36 +71,27 @@ def _aligned_run(
     run: RunResult, series: dict[Kind, ErrorSeries], sequence: Sequence
 ) -> tuple[RunResult, dict[Kind, ErrorSeries]]:
     """A run with its errors, after the alignments of its paths and of its map."""
-    paths: dict[Kind, Trajectory] = {}
+    moved: dict[str, Any] = {}
     alignments: dict[Kind, Alignment] = {}
     errors: dict[Kind, ErrorSeries] = {}
     for kind, own in series.items():
         path = run.causal if kind == "causal" else run.smoothed
         assert path is not None, "a run with errors has a path"
-        alignments[kind] = _of_path(path, own)
-        paths[kind] = _moved(path, alignments[kind])
-        errors[kind] = _aligned_errors(path, own, alignments[kind])
+        estimate = rows_at(path, own.stamps_ns)
+        # estimate minus error is the true path at these instants
+        truth = estimate.positions - own.position_m  # (n, 3)
+        alignments[kind] = align_yaw(estimate.positions, truth)
+        moved[kind] = alignments[kind].path(path)
+        errors[kind] = _aligned_errors(estimate, truth, own, alignments[kind])
     # a map of fewer than two true landmarks moves with the path that it was made on
     of_map = alignments["causal"]
     if run.landmarks is not None:
         of_map = _of_map(run.landmarks, sequence) or of_map
-    moved = replace(
-        run,
-        causal=paths.get("causal", run.causal),
-        smoothed=paths.get("smoothed", run.smoothed),
-        landmarks=None if run.landmarks is None else of_map.map(run.landmarks),
-        maps=[
-            replace(known, landmarks=of_map.map(known.landmarks)) for known in run.maps
-        ],
-    )
-    return moved, errors
-
-
-def _of_path(path: Trajectory, errors: ErrorSeries) -> Alignment:
-    """The alignment of a path to the truth at the scored instants."""
-    estimate = rows_at(path, errors.stamps_ns).positions  # (n, 3)
-    # estimate minus error is the true path at these instants
-    return align_yaw(estimate, estimate - errors.position_m)
+        moved["landmarks"] = of_map.map(run.landmarks)
+    moved["maps"] = [
+        replace(known, landmarks=of_map.map(known.landmarks)) for known in run.maps
+    ]
+    return replace(run, **moved), errors
 
 
 def _of_map(landmarks: LandmarkMap, sequence: Sequence) -> Alignment | None:
@@ -107,88 +100,47 @@ def _of_map(landmarks: LandmarkMap, sequence: Sequence) -> Alignment | None:
     scored = scored_map(landmarks, sequence)
     if true is None or scored is None:
         return None
-    _, rows, true_rows = np.intersect1d(
-        scored.landmarks.ids, true.ids, return_indices=True
-    )
-    if len(rows) < LEAST_MATCHED:
-        return None
-    return align_yaw(scored.landmarks.positions[rows], true.positions[true_rows])
-
-
-def _moved(path: Trajectory, alignment: Alignment) -> Trajectory:
-    """The path in the truth's world; covariances are in the body frame, so they stay."""
-    # heading errors are shown after the same turn as positions
-    turned = Rotation.from_matrix(alignment.rotation) * path.rotations()
-    return replace(
-        path,
-        positions=alignment.apply(path.positions),
-        quaternions_xyzw=turned.as_quat(),
-    )
+    named, targets = in_both(scored.landmarks, true)
+    return align_yaw(named.positions, targets) if len(named) >= LEAST_MATCHED else None
 
 
 def _aligned_errors(
-    path: Trajectory, errors: ErrorSeries, alignment: Alignment
+    estimate: Trajectory, truth: Floats, errors: ErrorSeries, alignment: Alignment
 ) -> ErrorSeries:
     """Errors after the alignment, with the reported covariances turned as the path is."""
     R = alignment.rotation
-    estimate = rows_at(path, errors.stamps_ns)
-    truth = estimate.positions - errors.position_m  # (n, 3)
     # the 95 % bands are along the axes of the truth's world
     covs = R @ world_position_covs(estimate) @ R.T  # (n, 3, 3)
-    variances = np.diagonal(covs, axis1=1, axis2=2)
     return replace(
         errors,
         position_m=alignment.apply(estimate.positions) - truth,
-        position_sigma_m=np.sqrt(np.maximum(variances, 0.0)),
+        position_sigma_m=sigmas(np.diagonal(covs, axis1=1, axis2=2)),
         # a turn about the vertical adds the same angle to every heading
         yaw_rad=wrap_angle(errors.yaw_rad + yaw_rad(R[None])),
     )
 
 
-# true landmarks that a map must name: of two, the errors alone would turn it
-LEAST_LANDMARKS = 3
-
-
 def own_map_errors(
     run: RunResult, sequence: Sequence, scored_ns: Ints
-) -> tuple[Ints, Floats]:
-    """Stamps and horizontal errors, shapes (k,), at those scored instants at which the run's map was kept.
+) -> dict[int, float]:
+    """Horizontal errors by the stamps of those scored instants at which the run's map was kept.
 
     Instants at which the map names fewer than `LEAST_LANDMARKS` true landmarks are left out.
     """
     truth = sequence.truth
     true = sequence.true_landmarks
     path = run.causal
-    stamps: list[int] = []
-    errors: list[float] = []
+    errors: dict[int, float] = {}
     if truth is None or true is None or path is None:
-        return np.array(stamps, dtype=np.int64), np.array(errors)
-    is_level = (
-        sequence.calibration.planar is not None or sequence.calibration.use_gravity
-    )
+        return errors
     # each error has an alignment of its own: the map of that instant
     for known in run.maps:
-        if (
-            known.stamp_ns not in scored_ns
-            or np.isin(known.landmarks.ids, true.ids).sum() < LEAST_LANDMARKS
-        ):
-            continue
-        alignment = align_map(known.landmarks, true, is_level=is_level)
-        assert alignment is not None
-        position = path.positions[path.stamps_ns == known.stamp_ns]
-        off = alignment.apply(position) - truth.at(np.array([known.stamp_ns])).positions
-        stamps.append(known.stamp_ns)
-        errors.append(float(np.linalg.norm(off[0, :2])))
-    return np.array(stamps, dtype=np.int64), np.array(errors)
-
-
-def shared_map_instants(
-    runs: Many[RunResult], sequence: Sequence, scored_ns: Ints
-) -> Ints:
-    """Stamps at which every run that can be scored on its map at all can be, shape (k,)."""
-    # a run without a map at all must not take all instants from the others
-    shared = scored_ns
-    for stamps_ns in (own_map_errors(run, sequence, scored_ns)[0] for run in runs):
-        if len(stamps_ns):
-            shared = np.intersect1d(shared, stamps_ns)
-    return shared
+        at_ns = np.array([known.stamp_ns])
+        named = np.isin(known.landmarks.ids, true.ids).sum()
+        if known.stamp_ns in scored_ns and named >= LEAST_LANDMARKS:
+            alignment = align_map(known.landmarks, true, sequence.calibration)
+            assert alignment is not None
+            position = rows_at(path, at_ns).positions
+            off = alignment.apply(position) - truth.at(at_ns).positions
+            errors[known.stamp_ns] = float(np.linalg.norm(off[0, :2]))
+    return errors

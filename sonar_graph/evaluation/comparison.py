@@ -18,7 +18,7 @@ import numpy as np
 from sonar_graph.diagnosis import compared
 from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.estimator import EstimatorChoice, name_of
-from sonar_graph.evaluation.aligned import shared_map_instants
+from sonar_graph.evaluation.aligned import own_map_errors
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.free_start import with_fitted_truth
 from sonar_graph.evaluation.results import (
@@ -32,6 +32,7 @@ from sonar_graph.evaluation.results import (
 from sonar_graph.evaluation.run import check_request, run_estimator
 from sonar_graph.evaluation.scored_instants import rows_at, scored_instants
 from sonar_graph.evaluation.scores import (
+    ScoredWords,
     detection_scores,
     landmark_scores,
     own_map_scores,
@@ -207,7 +208,9 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
     if is_flat:
         sequence = replace(sequence, notes={**sequence.notes, HEIGHTS: NO_HEIGHTS})
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
-    scores: dict[str, dict[str, Score]] = {run.estimator: ByName() for run in runs}
+    scores: dict[str, dict[str, Score]] = ByName(
+        {run.estimator: ByName() for run in runs}
+    )
     # a failed run has no numbers, and must not take instants from the others
     ended = [run for run in runs if run.status != "failed"]
     for run in ended:
@@ -217,23 +220,25 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             own |= landmark_scores(run.landmarks, sequence)
         if run.detections is not None:
             own |= detection_scores(run.detections)
-    by_name = ByName(scores)
-    comparison = Comparison(sequence, instants_ns, runs, by_name, errors, environment)
-    if sequence.truth is None or not len(sequence.truth):
+    comparison = Comparison(sequence, instants_ns, runs, scores, errors, environment)
+    if not true:
         environment["scored instants"] = (
             "none: the log has no truth, so no trajectory error can be given"
         )
         return comparison
-    scored = scored_instants(instants_ns, sequence.truth, runs)
+    scored = scored_instants(instants_ns, true, runs)
     # a reader of the protocol must see that the truth was moved
     fitted = f"; {unaligned(sequence)}" if FITTED in sequence.notes else ""
     environment["scored instants"] = f"{scored}{fitted}"
     if len(scored) < LEAST_INSTANTS:
         environment["scored instants"] += ": too few for any trajectory error"
         return comparison
-    truth = sequence.truth.at(scored.stamps_ns)
+    truth = true.at(scored.stamps_ns)
     # a planar vehicle has no error in z that an estimator could make
     position_dof = 3 if sequence.calibration.planar is None and not is_flat else 2
+    space = f"{'horizontal' if is_flat else '3-D'} position error"
+    words = ScoredWords(str(scored), unaligned(sequence), space)
+    on_maps: dict[str, dict[int, float]] = {}
     for run in runs:
         errors[run.estimator] = {}
         if run not in ended or run.causal is None or run.smoothed is None:
@@ -243,25 +248,18 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             # the same instants for every run and kind
             estimate = rows_at(trajectory, scored.stamps_ns)
             if is_flat:
-                z_m = truth.positions[:, 2]
-                estimate = replace(
-                    estimate,
-                    positions=np.column_stack([estimate.positions[:, :2], z_m]),
-                )
-            series = errors[run.estimator][kind] = error_series(
-                estimate, truth, position_dof
-            )
+                x_y_z = np.c_[estimate.positions[:, :2], truth.positions[:, 2]]
+                estimate = replace(estimate, positions=x_y_z)
+            series = error_series(estimate, truth, position_dof)
+            errors[run.estimator][kind] = series
             scores[run.estimator] |= trajectory_scores(
-                kind,
-                estimate,
-                truth,
-                series,
-                str(scored),
-                unaligned(sequence),
-                has_height=not is_flat,
+                kind, estimate, truth, series, words
             )
+        # a run without a map at all must not take all instants from the others
+        if own_errors := own_map_errors(run, sequence, scored.stamps_ns):
+            on_maps[run.estimator] = own_errors
     # errors on maps of other instants are of other lengths of the way
-    map_instants_ns = shared_map_instants(ended, sequence, scored.stamps_ns)
-    for run in ended:
-        scores[run.estimator] |= own_map_scores(run, sequence, map_instants_ns)
+    shared_ns = sorted(set(scored.stamps_ns.tolist()).intersection(*on_maps.values()))
+    for name, own_errors in on_maps.items():
+        scores[name] |= own_map_scores([own_errors[at_ns] for at_ns in shared_ns])
     return comparison

@@ -6,6 +6,7 @@ NEES and NIS: docs/theory/metrics.md (Bar-Shalom, Li, Kirubarajan 2001, section 
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.evaluation.metrics import yaw_errors_rad
 from sonar_graph.evaluation.results import ErrorSeries
@@ -37,28 +38,25 @@ def error_series(
     # a vehicle in a plane reports a height without uncertainty, whose NEES would be infinite
     axes = slice(0, position_dof)
 
-    def sigma(variances: Floats) -> Floats:
-        # rounding below zero counts as zero
-        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
-
+    position_unit = normalised(position_error[:, axes], position_cov[:, axes, axes])
+    yaw_unit = normalised(yaw_error[:, None], yaw_var[:, None, None])
     return ErrorSeries(
         stamps_ns=estimate.stamps_ns,
         position_m=position_error,
-        position_sigma_m=sigma(np.diagonal(position_cov, axis1=1, axis2=2)),
+        position_sigma_m=sigmas(np.diagonal(position_cov, axis1=1, axis2=2)),
         yaw_rad=yaw_error,
-        yaw_sigma_rad=sigma(yaw_var),
-        nees_position=normalised_squares(
-            position_error[:, axes], position_cov[:, axes, axes]
-        ),
-        nees_yaw=normalised_squares(yaw_error[:, None], yaw_var[:, None, None]),
+        yaw_sigma_rad=sigmas(yaw_var),
+        nees_position=np.sum(position_unit**2, axis=1),
+        nees_yaw=np.sum(yaw_unit**2, axis=1),
         position_dof=position_dof,
-        position_samples=effective_samples(
-            normalised(position_error[:, axes], position_cov[:, axes, axes])
-        ),
-        yaw_samples=effective_samples(
-            normalised(yaw_error[:, None], yaw_var[:, None, None])
-        ),
+        position_samples=effective_samples(position_unit),
+        yaw_samples=effective_samples(yaw_unit),
     )
+
+
+def sigmas(variances: Floats) -> Floats:
+    """Standard deviations; rounding below zero counts as zero."""
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
 def world_position_covs(trajectory: Trajectory) -> Floats:
@@ -109,7 +107,7 @@ def normalised(errors: Floats, covs: Floats) -> Floats:
     variances, axes = np.linalg.eigh(covs[known])
     along = np.einsum("nji,nj->ni", axes, errors[known])
     # a covariance with a zero eigenvalue claims certainty and has no NEES
-    definite = variances[:, 0] > 0 if len(variances) else np.zeros(0, dtype=bool)
+    definite = variances[:, 0] > 0
     scaled = along[definite] / np.sqrt(variances[definite])
     unit[np.flatnonzero(known)[definite]] = np.einsum(
         "nij,nj->ni", axes[definite], scaled
@@ -173,10 +171,20 @@ def nis(log: DetectionLog) -> Floats:
     >>> bool(0.5 < np.mean(values) / 2 < 2.0)
     True
     """
-    used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
-    # what the gate refused was chosen by its size, and would bias the mean
-    squares = normalised_squares(log.innovations[used], log.innovation_covs[used])
+    squares = used_squares(log)
     return squares[np.isfinite(squares)]
+
+
+def used_squares(log: DetectionLog) -> Floats:
+    """Normalised innovation squared of each detection, shape (n,); NaN where it was not used or not predicted."""
+    squares = normalised_squares(log.innovations, log.innovation_covs)
+    # what the gate refused was chosen by its size, and would bias the mean
+    return np.where(is_used(log), squares, np.nan)
+
+
+def is_used(log: DetectionLog) -> NDArray[np.bool_]:
+    """True for each detection that was used at once for a landmark that was known, shape (n,)."""
+    return np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
 
 
 class Likeness(NamedTuple):
@@ -219,12 +227,11 @@ def likeness(log: DetectionLog) -> Likeness:
     >>> bool((abs(likeness(run_estimator(small_world(), "ekf-slam").detections).correlation) < 0.5).all())
     True
     """
-    is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], bool)
-    is_used &= np.isfinite(log.innovation_covs).all(axis=(1, 2))
-    variances = np.diagonal(log.innovation_covs[is_used], axis1=1, axis2=2)
-    u = log.innovations[is_used] / np.sqrt(variances)  # (n, 2)
-    ids = log.landmark_ids[is_used]
-    stamps_ns = log.stamps_ns[is_used]
+    known = is_used(log) & np.isfinite(log.innovation_covs).all(axis=(1, 2))
+    variances = np.diagonal(log.innovation_covs[known], axis1=1, axis2=2)
+    u = log.innovations[known] / np.sqrt(variances)  # (n, 2)
+    ids = log.landmark_ids[known]
+    stamps_ns = log.stamps_ns[known]
     in_turn = np.lexsort((stamps_ns, ids))
     before = in_turn[:-1]
     after = in_turn[1:]
@@ -269,6 +276,5 @@ def anees_interval(
     """
     total = runs * dof
     tail = (1 - probability) / 2
-    return chi_square_quantile(tail, total) / total, chi_square_quantile(
-        1 - tail, total
-    ) / total
+    low, high = (chi_square_quantile(share, total) for share in (tail, 1 - tail))
+    return low / total, high / total

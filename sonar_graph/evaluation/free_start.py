@@ -19,13 +19,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.evaluation.metrics import Alignment
+from sonar_graph.evaluation.metrics import Alignment, yaw_rad
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.scored_instants import rows_at, scored_instants
 from sonar_graph.evaluation.tables import FITTED
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Trajectory
 
 # instants of a fit, and of its beginning, whose mean counts
 FEWEST = 3
@@ -55,7 +54,7 @@ def with_fitted_truth(
     """
     is_turned, is_moved = free_start(sequence.calibration)
     truth = sequence.truth
-    if truth is None or not len(truth) or not is_moved or FITTED in sequence.notes:
+    if not truth or not is_moved or FITTED in sequence.notes:
         return sequence
     at_ns = scored_instants(instants_ns, truth, runs).stamps_ns
     # a fit to one or two positions would take the error away that is to be shown
@@ -68,18 +67,13 @@ def with_fitted_truth(
             # the smoothed path has the least drift to disturb the fit
             path = rows_at(run.smoothed, at_ns).positions
             fit = fit_from_beginning(true, path, is_turned=is_turned)
-            fits.append(
-                (
-                    float(np.median(np.linalg.norm(fit.apply(true) - path, axis=1))),
-                    run.estimator,
-                    fit,
-                )
-            )
+            off_m = np.linalg.norm(fit.apply(true) - path, axis=1)
+            fits.append((float(np.median(off_m)), run.estimator, fit))
     if not fits:
         return sequence
     # one fit for all runs: a fit for each would hide which one begins wrong
     _, name, fit = min(fits, key=lambda one: one[0])
-    turn_deg = float(np.degrees(np.arctan2(fit.rotation[1, 0], fit.rotation[0, 0])))
+    (turn_deg,) = np.degrees(yaw_rad(fit.rotation[None]))
     what = "no start" if is_turned else "no position of the start"
     moved = ", ".join(f"{metres:.2f}" for metres in fit.translation)
     note = (
@@ -89,7 +83,7 @@ def with_fitted_truth(
     landmarks = sequence.true_landmarks
     return replace(
         sequence,
-        truth=moved_path(truth, fit),
+        truth=fit.path(truth),
         true_landmarks=None if landmarks is None else fit.map(landmarks),
         notes={**sequence.notes, FITTED: note},
     )
@@ -108,13 +102,3 @@ def fit_from_beginning(true: Floats, path: Floats, *, is_turned: bool) -> Alignm
         turn = float(np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v)))
     R = Rotation.from_euler("z", turn).as_matrix()
     return Alignment(R, begin_path - R @ begin)
-
-
-def moved_path(path: Trajectory, fit: Alignment) -> Trajectory:
-    """Poses in another world; their covariances are of the body's axes and stay."""
-    turned = path.quaternions_xyzw
-    if path.has_orientation:
-        turned = (Rotation.from_matrix(fit.rotation) * path.rotations()).as_quat()
-    return Trajectory(
-        path.stamps_ns, fit.apply(path.positions), turned, path.covariances
-    )

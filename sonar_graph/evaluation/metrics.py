@@ -12,7 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import NS_PER_S, Floats, Ints
 from sonar_graph.models import wrap_angle
@@ -48,11 +50,16 @@ class Alignment:
         """Landmarks moved into the truth's world, with their covariances."""
         # covariances turn with the points
         R = self.rotation
-        return LandmarkMap(
-            landmarks.ids,
-            self.apply(landmarks.positions),
-            R @ landmarks.covariances @ R.T,
-        )
+        moved = self.apply(landmarks.positions)
+        return LandmarkMap(landmarks.ids, moved, R @ landmarks.covariances @ R.T)
+
+    def path(self, path: Trajectory) -> Trajectory:
+        """Poses moved into the truth's world; their covariances are of the body's axes and stay."""
+        turned = path.quaternions_xyzw
+        if path.has_orientation:
+            turned = (Rotation.from_matrix(self.rotation) * path.rotations()).as_quat()
+        moved = self.apply(path.positions)
+        return Trajectory(path.stamps_ns, moved, turned, path.covariances)
 
     def inverse(self) -> Alignment:
         """The motion of the truth's world into the estimate's."""
@@ -145,55 +152,37 @@ def yaw_rad(matrices: Floats) -> Floats:
     return np.asarray(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]))
 
 
-def ate_raw_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """Absolute trajectory error: position rmse in three dimensions, both in the world of the start pose."""
-    check_paired(estimate, truth)
-    return rmse(estimate.positions - truth.positions)
-
-
-def ate_yaw_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """Position rmse in three dimensions after the best rotation about the vertical and translation."""
-    check_paired(estimate, truth)
-    return rmse(
-        align_yaw(estimate.positions, truth.positions).apply(estimate.positions)
-        - truth.positions
-    )
-
-
-def ate_se2_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """Horizontal position rmse after the best SE(2) alignment."""
-    check_paired(estimate, truth)
-    return horizontal_aligned_rmse(estimate.positions, truth.positions)
+def aligned_errors_m(points: Floats, targets: Floats) -> Floats:
+    """What is left of the distances after `align_yaw`, shape (n, 3); horizontally after the best SE(2) alignment."""
+    return align_yaw(points, targets).apply(points) - targets
 
 
 def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
-    """Estimated minus true heading, wrapped, shape (n,)."""
-    check_paired(estimate, truth)
+    """Estimated minus true heading, wrapped, shape (n,).
+
+    Raises `EvaluationError` for trajectories that are not at the same instants, or empty.
+    """
+    if not len(estimate) or not np.array_equal(estimate.stamps_ns, truth.stamps_ns):
+        raise EvaluationError(
+            f"an error needs estimate and truth at the same instants, at least one; got {len(estimate)} and "
+            f"{len(truth)} rows: bring the truth to the estimate's with Trajectory.at"
+        )
     return wrap_angle(yaw_rad(estimate.matrices) - yaw_rad(truth.matrices))
-
-
-@dataclass(frozen=True, eq=False)
-class RelativeErrors:
-    """Errors of the motion between instants a fixed time apart, one row a pair; pairs overlap."""
-
-    translation_m: Floats
-    """Norm of the translation of ``(true motion)⁻¹ (estimated motion)``, shape (k,)."""
-    yaw_rad: Floats
-    """Estimated minus true change of heading, wrapped, shape (k,)."""
-
-    def __len__(self) -> int:
-        return len(self.yaw_rad)
 
 
 def relative_errors(
     estimate: Trajectory, truth: Trajectory, delta_s: float
-) -> RelativeErrors:
-    """Errors of the motion over ``delta_s`` from every instant that has a partner that much later.
+) -> tuple[Floats, Floats]:
+    """Errors of the motion over ``delta_s`` from every instant that has a partner that much later; pairs overlap.
 
     The translation of a motion is the displacement in the body frame at the pair's first instant: an error of heading
     that is already there does not count again.
+
+    Returns
+    -------
+    translation_m : norm of the translation of ``(true motion)⁻¹ (estimated motion)``, shape (k,)
+    yaw_rad : estimated minus true change of heading, wrapped, shape (k,)
     """
-    check_paired(estimate, truth)
     # overlapping pairs use every instant, not only each tenth second
     first, second = pairs_apart(estimate.stamps_ns, delta_s)
 
@@ -203,10 +192,8 @@ def relative_errors(
 
     error_m = body_displacement(estimate) - body_displacement(truth)
     yaw_error = yaw_errors_rad(estimate, truth)
-    return RelativeErrors(
-        np.linalg.norm(error_m, axis=1),
-        wrap_angle(yaw_error[second] - yaw_error[first]),
-    )
+    turned = wrap_angle(yaw_error[second] - yaw_error[first])
+    return np.linalg.norm(error_m, axis=1), turned
 
 
 def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:
@@ -253,30 +240,21 @@ def landmark_errors(estimated: LandmarkMap, true: LandmarkMap) -> LandmarkErrors
     >>> errors.ids
     array([ 4,  9, 11])
     """
-    ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
-    # row i of both is the same landmark
-    points = estimated.positions[rows]
-    targets = true.positions[true_rows]
-    aligned = (
-        horizontal_aligned_rmse(points, targets) if len(ids) >= 2 else float("nan")
-    )
+    named, targets = in_both(estimated, true)
+    aligned_rmse_m = float("nan")
+    if len(named) >= 2:
+        aligned_rmse_m = rmse(aligned_errors_m(named.positions, targets)[:, :2])
+    errors = (named.positions - targets)[:, :2]
     return LandmarkErrors(
-        ids, (points - targets)[:, :2], estimated.covariances[rows][:, :2, :2], aligned
+        named.ids, errors, named.covariances[:, :2, :2], aligned_rmse_m
     )
 
 
-def horizontal_aligned_rmse(points: Floats, targets: Floats) -> float:
-    """Rmse in x and y after the best SE(2) alignment of points of shape (n, 3)."""
-    return rmse((align_yaw(points, targets).apply(points) - targets)[:, :2])
-
-
-def check_paired(estimate: Trajectory, truth: Trajectory) -> None:
-    """Raise `EvaluationError` for trajectories that are not at the same instants, or empty."""
-    if not len(estimate) or not np.array_equal(estimate.stamps_ns, truth.stamps_ns):
-        raise EvaluationError(
-            f"an error needs estimate and truth at the same instants, at least one; got {len(estimate)} and "
-            f"{len(truth)} rows: bring the truth to the estimate's with Trajectory.at"
-        )
+def in_both(estimated: LandmarkMap, true: LandmarkMap) -> tuple[LandmarkMap, Floats]:
+    """The landmarks that both maps have, as estimated, and their true positions in the same order, shape (k, 3)."""
+    ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
+    named = LandmarkMap(ids, estimated.positions[rows], estimated.covariances[rows])
+    return named, true.positions[true_rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,11 +277,8 @@ def scored_map(estimated: LandmarkMap, sequence: Sequence) -> ScoredMap | None:
     if true is None:
         return None
     alignment = None
-    if sequence.truth is None or not len(sequence.truth):
-        calibration = sequence.calibration
-        # a level estimate has no freedom in roll and pitch that alignment could take away
-        is_level = calibration.planar is not None or calibration.use_gravity
-        alignment = align_map(estimated, true, is_level=is_level)
+    if not sequence.truth:
+        alignment = align_map(estimated, true, sequence.calibration)
         if alignment is None:
             return None
         estimated = alignment.map(estimated)
@@ -311,7 +286,7 @@ def scored_map(estimated: LandmarkMap, sequence: Sequence) -> ScoredMap | None:
 
 
 def align_map(
-    estimated: LandmarkMap, true: LandmarkMap, *, is_level: bool = True
+    estimated: LandmarkMap, true: LandmarkMap, calibration: Calibration
 ) -> Alignment | None:
     """The alignment of a map to the true one by the landmarks that both name; None for fewer than needed.
 
@@ -319,9 +294,10 @@ def align_map(
     outside the fit of the others, such as those of a wrong identity, are left out (least trimmed squares, Rousseeuw and
     Van Driessen 2006: fits to the better half, then to all within `OUTLYING`).
     """
-    _, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
-    points = estimated.positions[rows]
-    targets = true.positions[true_rows]
+    # a level estimate has no freedom in roll and pitch that alignment could take away
+    is_level = calibration.planar is not None or calibration.use_gravity
+    named, targets = in_both(estimated, true)
+    points = named.positions
     fit = align_yaw if is_level else align_se3
     if len(points) < (2 if is_level else 3):
         return None
@@ -329,19 +305,17 @@ def align_map(
     if len(points) < LEAST_OUTVOTING:
         return alignment
 
-    def residuals(found: Alignment) -> Floats:
-        return np.asarray(
-            np.linalg.norm((found.apply(points) - targets)[:, :2], axis=1)
-        )
+    def residuals() -> Floats:
+        errors = alignment.apply(points) - targets
+        return np.asarray(np.linalg.norm(errors[:, :2], axis=1))
 
+    half = (len(points) + 3) // 2
     for _ in range(CONCENTRATIONS):
         # stable, so that equal residuals do not let the result hang on the machine
-        better = np.argsort(residuals(alignment), kind="stable")[
-            : (len(points) + 3) // 2
-        ]
+        better = np.argsort(residuals(), kind="stable")[:half]
         alignment = fit(points[better], targets[better])
     # the last fit uses all good landmarks, not only the better half
-    near = residuals(alignment) <= OUTLYING * np.median(residuals(alignment))
+    near = residuals() <= OUTLYING * np.median(residuals())
     return fit(points[near], targets[near])
 
 

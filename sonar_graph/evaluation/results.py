@@ -109,16 +109,11 @@ class RunResult:
         return params.get("gate_probability") == 1.0 and params.get("kernel_width") == 0
 
     def __repr__(self) -> str:
-        end = (
-            self.reason
-            or f"{counted(len(self.causal or ()), 'estimate')}, {counted(len(self.landmarks or ()), 'landmark')}"
-        )
-        if self.withheld:
-            more = len(self.withheld) - 1
-            end += f"; {self.withheld[0]}" + (
-                f" ({more} more in withheld)" * (more > 0)
-            )
-        return f"RunResult({self.estimator!r}: {self.status}, {end})"
+        counts = f"{counted(len(self.causal or ()), 'estimate')}, {counted(len(self.landmarks or ()), 'landmark')}"
+        first = "".join(f"; {message}" for message in self.withheld[:1])
+        more = len(self.withheld) - 1
+        others = f" ({more} more in withheld)" * (more > 0)
+        return f"RunResult({self.estimator!r}: {self.status}, {self.reason or counts}{first}{others})"
 
 
 @dataclass(frozen=True)
@@ -338,31 +333,22 @@ class RefusedRows:
     @classmethod
     def of(cls, rows: list[RefusedRow]) -> RefusedRows:
         """One summary of rows with the same sensor and reason."""
+        first = rows[0]
         stamps_ns = [row.stamp_ns for row in rows]
-        distances = [row.distance for row in rows if not math.isnan(row.distance)]
-        ends = (min(distances), max(distances)) if distances else None
-        return cls(
-            rows[0].sensor,
-            rows[0].reason,
-            len(rows),
-            min(stamps_ns),
-            max(stamps_ns),
-            ends,
-        )
+        known = [row.distance for row in rows if not math.isnan(row.distance)]
+        ends = (min(known), max(known)) if known else None
+        times_ns = min(stamps_ns), max(stamps_ns)
+        return cls(first.sensor, first.reason, len(rows), *times_ns, ends)
 
     def times(self, start_ns: int) -> str:
         """First and last stamp in seconds after the start."""
-        return " to ".join(
-            f"{(stamp_ns - start_ns) * 1e-9:.3f}"
-            for stamp_ns in sorted({self.first_ns, self.last_ns})
-        )
+        ends_ns = sorted({self.first_ns, self.last_ns})
+        return " to ".join(f"{(at_ns - start_ns) * 1e-9:.3f}" for at_ns in ends_ns)
 
     def distances(self) -> str:
         """Least and largest squared distance; empty where the reason has none."""
-        return " to ".join(
-            format_value(distance)
-            for distance in sorted(set(self.least_and_largest_distance or ()))
-        )
+        ends = sorted(set(self.least_and_largest_distance or ()))
+        return " to ".join(map(format_value, ends))
 
 
 def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
@@ -375,8 +361,10 @@ def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
     found: list[RefusedRows] = []
     for _, alike in groupby(ordered, key=lambda row: (row.sensor, row.reason)):
         several = list(alike)
-        is_one = len(several) > MOST_ROWS_NAMED
-        is_one |= all(math.isnan(row.distance) for row in several)
-        together = [several] if is_one else [[row] for row in several]
-        found += map(RefusedRows.of, together)
+        # rows that differ in their time alone are one line
+        summary = RefusedRows.of(several)
+        if summary.count > MOST_ROWS_NAMED or not summary.least_and_largest_distance:
+            found.append(summary)
+        else:
+            found += [RefusedRows.of([row]) for row in several]
     return found

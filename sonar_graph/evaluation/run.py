@@ -9,7 +9,7 @@ import logging
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +28,6 @@ from sonar_graph.estimator import (
     Candidate,
     Estimator,
     EstimatorChoice,
-    MakeEstimator,
     is_foreign,
     known_map_of,
     load_estimator,
@@ -44,7 +43,7 @@ from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import kept_map_instants
 from sonar_graph.files import KilledError, OwnProcess, Tell, noticed_interrupts, serve
 from sonar_graph.map_file import map_origin
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
+from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import (
     DetectionLog,
@@ -122,39 +121,21 @@ def check_outcome(
         raise EvaluationError(
             f"trajectory() lacks {len(missing)} of the {len(causal)} instants for which process returned estimates"
         )
-    for kind, trajectory in (("causal", causal), ("smoothed", smoothed)):
-        # one look at all numbers of a pose: a NaN in the rotation spoils every score too
-        rows = np.column_stack([trajectory.positions, trajectory.quaternions_xyzw])
-        _refuse(
-            _not_finite(rows), f"{kind} pose is not finite", trajectory.stamps_ns, "ns"
-        )
-        _refuse(
-            _impossible(trajectory.covariances),
-            f"{kind} covariance is impossible",
-            trajectory.stamps_ns,
-            "ns",
-        )
-    _refuse(
-        _not_finite(landmarks.positions),
-        "position is not finite",
-        landmarks.ids,
-        "landmark",
-    )
-    _refuse(
-        _impossible(landmarks.covariances),
-        "covariance is impossible",
-        landmarks.ids,
-        "landmark",
-    )
-
-
-def _refuse(bad: Flags, fault: str, labels: Ints, unit: str) -> None:
-    """Raise for the first bad row, naming it and how many there are."""
-    rows = np.flatnonzero(bad)
-    if rows.size:
-        raise EvaluationError(
-            f"{fault} in {rows.size} of {len(bad)} rows, first at {unit} {labels[rows[0]]}"
-        )
+    # one look at all numbers of a pose: a NaN in the rotation spoils every score too
+    poses = [np.c_[one.positions, one.quaternions_xyzw] for one in (causal, smoothed)]
+    for what, bad, unit, labels in (
+        ("causal pose is not finite", _not_finite(poses[0]), "ns", causal.stamps_ns),
+        ("causal covariance is impossible", _impossible(causal.covariances), "ns", causal.stamps_ns),
+        ("smoothed pose is not finite", _not_finite(poses[1]), "ns", smoothed.stamps_ns),
+        ("smoothed covariance is impossible", _impossible(smoothed.covariances), "ns", smoothed.stamps_ns),
+        ("position is not finite", _not_finite(landmarks.positions), "landmark", landmarks.ids),
+        ("covariance is impossible", _impossible(landmarks.covariances), "landmark", landmarks.ids),
+    ):  # fmt: skip
+        rows = np.flatnonzero(bad)
+        if rows.size:
+            raise EvaluationError(
+                f"{what} in {rows.size} of {len(bad)} rows, first at {unit} {labels[rows[0]]}"
+            )
 
 
 def _not_finite(rows: Floats) -> Flags:
@@ -163,17 +144,15 @@ def _not_finite(rows: Floats) -> Flags:
 
 def _impossible(covs: Floats) -> Flags:
     """Flags of covariances, shape (n, d, d), that are partly NaN, infinite, asymmetric or not positive semidefinite."""
-    n = len(covs)
-    rows = covs.reshape(n, covs.shape[1] * covs.shape[2])
     # NaN stands for an unreported covariance, which is no fault
-    unknown = np.all(np.isnan(rows), axis=1)
-    finite = ~_not_finite(rows)
+    unknown = np.isnan(covs).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(covs).all(axis=(1, 2)))
     # eigvalsh fails for NaN; rows that are not finite are refused all the same, by `finite` below
     filled = np.where(finite[:, None, None], covs, 0.0)
     # tolerances are relative: covariances of centimetres and of kilometres are judged alike
     size = np.abs(filled).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-    smallest = np.linalg.eigvalsh(filled)[:, 0] if n else np.zeros(0)
+    smallest = np.linalg.eigvalsh(filled)[:, 0]
     sound = (
         finite & (asymmetry <= 1e-6 * size) & (smallest >= -NEGATIVE_TOLERANCE * size)
     )
@@ -242,7 +221,11 @@ def run_estimator(
     # code of another package may change numpy, the folder or the environment of this process
     if isinstance(estimator, str) and is_foreign(name):
         request = _Request(name, overrides or {}, sequence, instants, interim_maps)
-        return _run_apart(request, progress)
+        try:
+            result: RunResult = _asked(request, progress)
+        except KilledError as error:
+            return _unrun(name, overrides, str(error))
+        return result
     return run_here(
         sequence,
         estimator,
@@ -264,28 +247,30 @@ def run_here(
 ) -> RunResult:
     """Do a run in this process, also of an estimator of another package; otherwise as `run_estimator`."""
     name = name_of(estimator)
-    try:
-        kind = _loaded(estimator)
-    except UnknownEstimatorError:
-        raise
-    except EstimatorError as error:
-        return RunResult(name, dict(overrides or {}), "failed", one_line(error))
-    candidate = make_candidate(kind, overrides or {}, name)
+    candidate = _candidate(estimator, overrides)
+    if isinstance(candidate, EstimatorError):
+        return _unrun(name, overrides, one_line(candidate))
     # an estimator may write into the arrays that it gets, which the next one needs unchanged
-    own = copy.deepcopy(sequence)
-    replay = _Replay(
-        sequence,
-        list(own.replay(instants_ns)),
-        name,
-        candidate,
-        interim_maps=interim_maps,
-    )
+    steps = list(copy.deepcopy(sequence).replay(instants_ns))
+    replay = _Replay(sequence, steps, name, candidate, interim_maps=interim_maps)
     return replay.run(progress)
 
 
-def _loaded(estimator: EstimatorChoice) -> type[Estimator] | MakeEstimator:
-    """Class or function; an `EstimatorError` where an installed estimator cannot be loaded."""
-    return load_estimator(estimator) if isinstance(estimator, str) else estimator
+def _unrun(name: str, overrides: dict[str, Any] | None, reason: str) -> RunResult:
+    return RunResult(name, dict(overrides or {}), "failed", reason)
+
+
+def _candidate(
+    estimator: EstimatorChoice, overrides: dict[str, Any] | None
+) -> Candidate | EstimatorError:
+    """The estimator with its settings, or why an installed one cannot be loaded; raises for mistakes of the user."""
+    try:
+        kind = load_estimator(estimator) if isinstance(estimator, str) else estimator
+    except UnknownEstimatorError:
+        raise
+    except EstimatorError as error:
+        return error
+    return make_candidate(kind, overrides or {}, name_of(estimator))
 
 
 def check_request(
@@ -298,20 +283,13 @@ def check_request(
 
     Raises for a name or setting that does not exist, as `run_estimator` does, without running anything.
     """
-    name = name_of(estimator)
-    if not is_apart and isinstance(estimator, str) and is_foreign(name):
-        with _process() as process:
-            try:
-                return _asked(process, _Request(name, overrides or {}), None)
-            except KilledError:
-                return None
-    try:
-        kind = _loaded(estimator)
-    except UnknownEstimatorError:
-        raise
-    except EstimatorError:
-        return None
-    return make_candidate(kind, overrides or {}, name).settings()
+    if not is_apart and isinstance(estimator, str) and is_foreign(estimator):
+        try:
+            return _asked(_Request(estimator, overrides or {}))
+        except KilledError:
+            return None
+    candidate = _candidate(estimator, overrides)
+    return None if isinstance(candidate, EstimatorError) else candidate.settings()
 
 
 @dataclass(frozen=True)
@@ -326,40 +304,22 @@ class _Request:
     path: list[str] = field(default_factory=lambda: list(sys.path))
 
 
-@contextlib.contextmanager
-def _process() -> Iterator[OwnProcess]:
+def _asked(
+    request: _Request, progress: Callable[[int, int], None] | None = None
+) -> Any:
+    """The answer of a process of its own; a `KilledError` where that ended without one."""
     process = OwnProcess(
         ("-c", "from sonar_graph.evaluation.run import serve_runs; serve_runs()")
     )
     try:
-        yield process
+        process.answer()  # that it is ready
+        process.send(request)
+        while isinstance(answer := process.answer(), _StepsDone):
+            if progress:
+                progress(*answer)
+        return None if answer == NOTHING else answer
     finally:
         process.end()
-
-
-def _asked(
-    process: OwnProcess, request: _Request, progress: Callable[[int, int], None] | None
-) -> Any:
-    # the first answer is no result
-    process.answer()  # that it is ready
-    process.send(request)
-    while isinstance(answer := process.answer(), _StepsDone):
-        if progress:
-            progress(*answer)
-    return None if answer == NOTHING else answer
-
-
-def _run_apart(
-    request: _Request, progress: Callable[[int, int], None] | None
-) -> RunResult:
-    with _process() as process:
-        try:
-            result: RunResult = _asked(process, request, progress)
-        except KilledError as error:
-            return RunResult(
-                request.name, dict(request.overrides), "failed", str(error)
-            )
-        return result
 
 
 class _StepsDone(NamedTuple):
@@ -462,18 +422,12 @@ class _Replay:
 
     def _warm_up(self) -> None:
         """Let an estimator that is thrown away compile its code, until landmarks were seen again."""
-
-        def is_named(
-            detections: LandmarkDetections | None,
-        ) -> bool:  # others are refused, and nothing is compiled
-            return bool(
-                detections is not None
-                and len(detections)
-                and detections.most_probable()[1].max() > 0.5
-            )
-
-        # code for a landmark that is seen again runs only after a detection that names one
-        named = [i for i, step in enumerate(self._steps) if is_named(step.detections)]
+        # code for a landmark that is seen again runs only after a detection that names one; others are refused
+        named = [
+            i
+            for i, step in enumerate(self._steps)
+            if step.detections and step.detections.most_probable()[1].max() > 0.5
+        ]
         last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
         with contextlib.suppress(
             Exception, SystemExit
@@ -488,9 +442,7 @@ class _Replay:
         self, estimator: Estimator, progress: Callable[[int, int], None] | None
     ) -> None:
         # loads numba, which an estimator needs and a result does not
-        from sonar_graph.numerics import (
-            compiling_s,
-        )
+        from sonar_graph.numerics import compiling_s
 
         for done, step in enumerate(self._steps, start=1):
             end_ns = step.end_ns
@@ -503,16 +455,15 @@ class _Replay:
             self._check_interrupt()
             # None is allowed: a smoother may wait before its first estimate
             estimate = returned_estimate(estimate)
-            if estimate is not None and estimate.stamp_ns != end_ns:
-                raise EvaluationError(
-                    f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns"
-                )
             if estimate is not None:
+                if estimate.stamp_ns != end_ns:
+                    raise EvaluationError(
+                        f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns"
+                    )
                 self._estimates.append(estimate)
                 if end_ns in self._map_at_ns:
-                    landmarks = returned(
-                        estimator.landmarks(), LandmarkMap, "landmarks()"
-                    )
+                    landmarks = estimator.landmarks()
+                    returned(landmarks, LandmarkMap, "landmarks()")
                     self._maps.append(MapSoFar(end_ns, landmarks))
             if progress:
                 progress(done, len(self._steps))

@@ -37,9 +37,8 @@ def published_maps() -> tuple[LandmarkMap, LandmarkMap]:
     """Table I as maps: estimated and true. Heights and covariances are not published: 0 and NaN."""
     unknown = np.full((len(IDS), 3, 3), np.nan)
     # the paper gives no heights
-    on_floor = np.zeros((len(IDS), 1))
     estimated, true = (
-        LandmarkMap(IDS, np.hstack([xy, on_floor]), unknown)
+        LandmarkMap(IDS, np.c_[xy, np.zeros(len(IDS))], unknown)
         for xy in (ESTIMATED_XY_M, TRUE_XY_M)
     )
     return estimated, true
@@ -86,9 +85,8 @@ class ScoredInstants:
             (self.not_estimated, "without an estimate from every estimator"),
         )
         reasons = ", ".join(f"{count} {why}" for count, why in left_out if count)
-        return f"{len(self)} of {self.asked} instants" + (
-            f" (left out: {reasons})" if reasons else ""
-        )
+        why = f" (left out: {reasons})" if reasons else ""
+        return f"{len(self)} of {self.asked} instants{why}"
 
 
 def scored_instants(
@@ -99,12 +97,8 @@ def scored_instants(
     # a line between truth samples far apart is no truth
     gap_s = gap_limit_s(truth)
     # an instant of a truth sample has this sample on both sides, and so is in no gap
-    after = np.clip(
-        np.searchsorted(truth.stamps_ns, asked_ns, side="left"), 0, len(truth) - 1
-    )
-    before = np.clip(
-        np.searchsorted(truth.stamps_ns, asked_ns, side="right") - 1, 0, len(truth) - 1
-    )
+    after = np.searchsorted(truth.stamps_ns, asked_ns).clip(max=len(truth) - 1)
+    before = np.searchsorted(truth.stamps_ns, asked_ns, side="right").clip(min=1) - 1
     in_gap = (truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9 > gap_s
     covered = inside & ~in_gap
     estimated = np.ones(len(asked_ns), dtype=bool)
@@ -126,12 +120,10 @@ def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
     """The instants nearest to the published times, scaled to the run's length; the last one included."""
     if not len(asked_ns):
         return asked_ns
-    wanted_ns = (
-        start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
-    )
-    return np.unique(
-        asked_ns[np.abs(asked_ns[None, :] - wanted_ns[:, None]).argmin(axis=1)]
-    )
+    length_ns = asked_ns[-1] - start_ns
+    wanted_ns = start_ns + length_ns * np.array(MAP_TIMES_S) / DURATION_S
+    apart_ns = np.abs(asked_ns[None, :] - wanted_ns[:, None])
+    return np.unique(asked_ns[apart_ns.argmin(axis=1)])
 
 
 def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
@@ -143,12 +135,10 @@ def kept_map_instants(asked_ns: Ints, start_ns: int) -> Ints:
 
 def gap_limit_s(truth: Trajectory) -> float:
     """The distance between truth samples beyond which nothing is interpolated, seconds."""
-    spacing_s = np.diff(truth.stamps_ns) * 1e-9
-    return (
-        max(TRUTH_GAP_S, GAP_TO_SPACING * float(np.median(spacing_s)))
-        if spacing_s.size
-        else TRUTH_GAP_S
-    )
+    if len(truth) < 2:
+        return TRUTH_GAP_S
+    spacing_s = float(np.median(np.diff(truth.stamps_ns) * 1e-9))
+    return max(TRUTH_GAP_S, GAP_TO_SPACING * spacing_s)
 
 
 def rows_at(trajectory: Trajectory, stamps_ns: Ints) -> Trajectory:

@@ -2,10 +2,11 @@
 
 import math
 from collections import Counter
+from typing import NamedTuple
 
 import numpy as np
 
-from sonar_graph.evaluation.aligned import LEAST_LANDMARKS, own_map_errors
+from sonar_graph.evaluation.aligned import LEAST_LANDMARKS
 from sonar_graph.evaluation.consistency import (
     GATED_SHARE,
     anees_interval,
@@ -16,18 +17,14 @@ from sonar_graph.evaluation.consistency import (
 )
 from sonar_graph.evaluation.metrics import (
     FARTHEST_M,
-    ate_raw_m,
-    ate_se2_m,
-    ate_yaw_m,
+    aligned_errors_m,
     landmark_errors,
     relative_errors,
     rmse,
     scored_map,
-    yaw_errors_rad,
 )
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.tables import unaligned
-from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
@@ -42,7 +39,19 @@ USED = {
     *(Outcome.USED, Outcome.NEW, Outcome.USED_LATER),
     *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
 }
+UNNAMED = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN}
 IN_TIME = "errors of successive instants are correlated: their mean is worth {} independent samples, for which the band is"
+
+
+class ScoredWords(NamedTuple):
+    """What the protocols of a comparison's trajectories have in common."""
+
+    instants: str
+    """The scored instants."""
+    world: str
+    """`unaligned`."""
+    space: str
+    """Position errors, in the directions that the truth has."""
 
 
 def trajectory_scores(
@@ -50,91 +59,73 @@ def trajectory_scores(
     estimate: Trajectory,
     truth: Trajectory,
     errors: ErrorSeries,
-    instants: str,
-    world: str,
-    *,
-    has_height: bool = True,
+    words: ScoredWords,
 ) -> dict[str, Score]:
     """Accuracy and consistency of one trajectory, under keys that begin with its kind.
 
-    Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols, and
-    ``world`` is `unaligned`. Scores that need true orientations are left out where the truth has positions only.
-    Without ``has_height`` the caller has set the estimate's heights to those of the truth, and errors are of x and y.
+    Estimate, truth and errors are at the scored instants. Scores that need true orientations are left out where the
+    truth has positions only. Where it has no heights, the caller has set those of the estimate to those of the truth.
     """
+    instants, world, space = words
     which = ESTIMATES[kind]
     # each protocol is one sentence that can be quoted alone
     over = f"over {instants}, to which the truth is interpolated"
-    space = f"{'3-D' if has_height else 'horizontal'} position error"
     fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
+    aligned_m = aligned_errors_m(estimate.positions, truth.positions)
     rules = [
-        ("ate_raw_m", ate_raw_m(estimate, truth), "m", f"{world}: rms of {space}"),
-        ("ate_yaw_m", ate_yaw_m(estimate, truth), "m", f"aligned by yaw and translation {fitted} {space}"),
-        ("ate_se2_m", ate_se2_m(estimate, truth), "m", f"aligned by SE(2) {fitted} horizontal position error"),
-        ("yaw_rmse_rad", rmse(yaw_errors_rad(estimate, truth)), "rad", f"{world}: rms of wrapped heading error"),
+        ("ate_raw_m", errors.position_m, f", {world}: rms of {space} {over}"),
+        ("ate_yaw_m", aligned_m, f", aligned by yaw and translation {fitted} {space} {over}"),
+        ("ate_se2_m", aligned_m[:, :2], f", aligned by SE(2) {fitted} horizontal position error {over}"),
+        ("yaw_rmse_rad", errors.yaw_rad, f", {world}: rms of wrapped heading error {over}"),
     ]  # fmt: skip
-    scores = _finite(
-        {
-            key: Score(value, unit, f"{which}, {rule} {over}.")
-            for key, value, unit, rule in rules
-        }
-    )
     # displacement is in the body frame, for which a true orientation is needed
-    relative = relative_errors(estimate, truth, RELATIVE_DELTA_S)
-    if len(relative) and truth.has_orientation:
+    moved_m, turned_rad = relative_errors(estimate, truth, RELATIVE_DELTA_S)
+    if len(moved_m) and truth.has_orientation:
         pairs = (
-            f"over {len(relative)} overlapping pairs {RELATIVE_DELTA_S} s apart, {over}"
+            f"over {len(moved_m)} overlapping pairs {RELATIVE_DELTA_S} s apart, {over}"
         )
-        scores["rpe_10s_m"] = Score(
-            rmse(relative.translation_m),
-            "m",
-            f"{which}: rms of the error of body-frame displacement {pairs}.",
-        )
-        scores["rpe_10s_rad"] = Score(
-            rmse(relative.yaw_rad),
-            "rad",
-            f"{which}: rms of the error of heading change {pairs}.",
-        )
+        rules += [
+            ("rpe_10s_m", moved_m, f": rms of the error of body-frame displacement {pairs}"),
+            ("rpe_10s_rad", turned_rad, f": rms of the error of heading change {pairs}"),
+        ]  # fmt: skip
+    scores = {
+        key: Score(rmse(values), key.rpartition("_")[2], f"{which}{rule}.")
+        for key, values, rule in rules
+    }
     axes = "x and y" if errors.position_dof == 2 else "x, y and z"
-    parts = (
-        (
-            "nees_position",
-            errors.nees_position,
-            errors.position_dof,
-            errors.position_samples,
-            f"position ({axes})",
-        ),
-        ("nees_yaw", errors.nees_yaw, 1, errors.yaw_samples, "heading"),
-    )
-    for key, nees, dof, samples, what in parts:
+    parts = [
+        (errors.nees_position, errors.position_dof, errors.position_samples, f"position ({axes})"),
+        (errors.nees_yaw, 1, errors.yaw_samples, "heading"),
+    ]  # fmt: skip
+    for key, (nees, dof, samples, what) in zip(
+        ("nees_position", "nees_yaw"), parts, strict=True
+    ):
         # the protocol states how many instants the mean is of
         known = int(np.isfinite(nees).sum())
-        mean = mean_normalised(nees, dof)
-        if not math.isfinite(mean):
-            continue
         protocol = (
             f"{which}, {world}: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
             f"have a covariance; 1 is consistent; {IN_TIME.format(samples)}."
         )
-        scores[key] = Score(
-            mean, "1", protocol, time_average_interval(samples, dof), better="inside"
-        )
-    return {f"{kind}.{key}": score for key, score in scores.items()}
+        interval = time_average_interval(samples, dof)
+        mean = mean_normalised(nees, dof)
+        scores[key] = Score(mean, "1", protocol, interval, better="inside")
+    return {f"{kind}.{key}": score for key, score in _finite(scores).items()}
 
 
 def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Score]:
     """The final map against the true one, where there is one."""
-    count = Score(
-        float(len(estimated)), "1", "Landmarks in the map at the end.", better="none"
-    )
+    mapped = float(len(estimated))
+    count = Score(mapped, "1", "Landmarks in the map at the end.", better="none")
+    scores = {"landmarks.count": count}
     true = sequence.true_landmarks
     scored = scored_map(estimated, sequence)
     if true is None or scored is None:
-        return {"landmarks.count": count}
+        return scores
     named = scored.landmarks
     is_aligned = scored.alignment is not None
     errors = landmark_errors(named, true)
     if not len(errors):
-        return {"landmarks.count": count}
+        return scores
     by_place = len(np.setdiff1d(named.ids, estimated.ids))
     how = (
         f"by identity, {by_place} of them by place within {FARTHEST_M:g} m"
@@ -150,40 +141,33 @@ def landmark_scores(estimated: LandmarkMap, sequence: Sequence) -> dict[str, Sco
         else unaligned(sequence)
     )
     dof = 2 * len(errors) - (3 if is_aligned else 0)
-    scores = {
-        "landmarks.se2_m": Score(errors.aligned_rmse_m, "m", f"{which}, {se2}."),
-        "landmarks.count": count,
-        "landmarks.nees": Score(
-            float(nees.sum() / dof) if dof else math.nan,
-            "1",
-            f"{which}, {where}: sum of normalised squared horizontal errors divided by {dof}; 1 is consistent; "
-            "landmarks of one map are correlated, so no band is given.",
-            better="inside",
-        ),
-    }
-    if not is_aligned:
-        raw = Score(
-            rmse(errors.horizontal_m),
-            "m",
-            f"{which}, {where}: rms of horizontal error.",
-        )
-        scores = {"landmarks.raw_m": raw, **scores}
-    return _finite(scores)
+    mean = float(nees.sum() / dof) if dof else math.nan
+    rule = (
+        f"{which}, {where}: sum of normalised squared horizontal errors divided by {dof}; 1 is consistent; "
+        "landmarks of one map are correlated, so no band is given."
+    )
+    raw = f"{which}, {where}: rms of horizontal error."
+    raw_m = math.nan if is_aligned else rmse(errors.horizontal_m)
+    return _finite(
+        {
+            "landmarks.raw_m": Score(raw_m, "m", raw),
+            "landmarks.se2_m": Score(errors.aligned_rmse_m, "m", f"{which}, {se2}."),
+            **scores,
+            "landmarks.nees": Score(mean, "1", rule, better="inside"),
+        }
+    )
 
 
-def own_map_scores(
-    run: RunResult, sequence: Sequence, instants_ns: Ints
-) -> dict[str, Score]:
+def own_map_scores(errors_m: list[float]) -> dict[str, Score]:
     """The causal position on the run's own map at instants that all runs with a map share."""
-    stamps_ns, errors_m = own_map_errors(run, sequence, instants_ns)
-    if not len(stamps_ns):
+    if not errors_m:
         return {}
     rule = (
-        f"Causal estimate at {len(stamps_ns)} instants, moved by the alignment of the estimator's map as it was then "
+        f"Causal estimate at {len(errors_m)} instants, moved by the alignment of the estimator's map as it was then "
         "to the true landmarks: rms of horizontal position error; of the instants at which maps are kept those at "
         f"which every estimator that maps so many knows {LEAST_LANDMARKS} landmarks."
     )
-    return {"causal.own_map_m": Score(rmse(errors_m), "m", rule)}
+    return {"causal.own_map_m": Score(rmse(np.array(errors_m)), "m", rule)}
 
 
 def detection_scores(log: DetectionLog) -> dict[str, Score]:
@@ -192,11 +176,7 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     new = counts[Outcome.NEW]
     ignored = counts[Outcome.IGNORED]
     used = sum(counts[outcome] for outcome in USED)
-    unnamed = (
-        counts[Outcome.NO_IDENTITY]
-        + counts[Outcome.WAITING]
-        + counts[Outcome.FORGOTTEN]
-    )
+    unnamed = sum(counts[outcome] for outcome in UNNAMED)
     refused = len(log) - used - ignored - unnamed
     of_all = f"of {len(log)}" + (
         f", {ignored} of which this estimator has no use for" if ignored else ""
@@ -215,13 +195,14 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     squares = nis(log)
     is_gated_much = counts[Outcome.GATED] > GATED_SHARE * len(log)
     if squares.size:
-        scores["detections.nis"] = Score(
-            mean_normalised(squares, 2),
-            "1",
+        rule = (
             f"Mean normalised squared innovation of {squares.size} detections used, divided by 2; 1 is consistent; the "
-            "two-sided 95 % band takes innovations as independent; what a gate refused is not in it, which lowers it.",
-            anees_interval(squares.size, 2),
-            "none" if is_gated_much else "inside",
+            "two-sided 95 % band takes innovations as independent; what a gate refused is not in it, which lowers it."
+        )
+        mean = mean_normalised(squares, 2)
+        band = anees_interval(squares.size, 2)
+        scores["detections.nis"] = Score(
+            mean, "1", rule, band, "none" if is_gated_much else "inside"
         )
     return scores
 
@@ -238,19 +219,23 @@ def resource_scores(run: RunResult, log_s: float) -> dict[str, Score]:
         "Highest resident memory of the process during the run above that at its start (Linux); memory freed by "
         "earlier runs is reused without being counted."
     )
-    scores = {
-        "time.update_median_ms": Score(float(np.median(ms)), "ms", f"Median {calls}."),
-        "time.update_p99_ms": Score(
-            float(np.quantile(ms, 0.99)), "ms", f"99th percentile of {calls}."
-        ),
-        "time.update_max_ms": Score(
-            float(ms.max()), "ms", f"Longest {calls}; compiling is not counted."
-        ),
-        "time.total_s": Score(total_s, "s", f"Wall-clock time of {whole}."),
-        "time.real_time_factor": Score(log_s / total_s, "1", speed, better="higher"),
-        "memory.peak_mb": Score(run.peak_memory_mb, "MB", memory),
-    }
-    return _finite(scores)
+    rules = [
+        ("time.update_median_ms", np.median(ms), "ms", f"Median {calls}."),
+        ("time.update_p99_ms", np.quantile(ms, 0.99), "ms", f"99th percentile of {calls}."),
+        ("time.update_max_ms", ms.max(), "ms", f"Longest {calls}; compiling is not counted."),
+        ("time.total_s", total_s, "s", f"Wall-clock time of {whole}."),
+        ("time.real_time_factor", log_s / total_s, "1", speed),
+        ("memory.peak_mb", run.peak_memory_mb, "MB", memory),
+    ]  # fmt: skip
+    # the last ratio alone is better when it is higher
+    return _finite(
+        {
+            key: Score(
+                float(value), unit, rule, better="higher" if unit == "1" else "lower"
+            )
+            for key, value, unit, rule in rules
+        }
+    )
 
 
 def _finite(scores: dict[str, Score]) -> dict[str, Score]:

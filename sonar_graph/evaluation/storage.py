@@ -20,7 +20,7 @@ absent object has no fields.
 import io
 import zipfile
 from collections.abc import Iterable
-from dataclasses import MISSING, asdict, fields
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -124,18 +124,13 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     # the name becomes a folder: one with a separator would leave the folder that was given
     names = [run.estimator for run in comparison.runs]
     for name in names:
-        if name in ("", ".", "..") or any(
-            character in name for character in '/\\:*?"<>|'
-        ):
+        if name in ("", ".", "..") or set(name) & set('/\\:*?"<>|'):
             raise EvaluationError(
                 f"estimator name {name!r} cannot name a folder; install it under another name"
             )
+    folders = (f"{RUNS}/", f"{PICTURE_FOLDER}/")
     with result_written(folder, COMPARISON) as written:
-        earlier = (
-            name
-            for name in written.names
-            if name.startswith((f"{RUNS}/", f"{PICTURE_FOLDER}/"))
-        )
+        earlier = (name for name in written.names if name.startswith(folders))
         # a page or a run of an earlier comparison would contradict the new numbers
         written.remove([INDEX, PAGE, RECOGNITION, *earlier])
         _write(comparison, folder)
@@ -145,17 +140,18 @@ def _write(comparison: Comparison, folder: Path) -> None:
     # all other rows of IMU and Doppler log are in the log
     sequence = comparison.sequence
     ends = np.array([0, -1])
-    arrays = _pack("imu", sequence.imu.rows(ends)) | _pack(
-        "dvl", sequence.dvl.rows(ends)
-    )
-    arrays |= _pack("truth", sequence.truth) | _pack(
-        "true_landmarks", sequence.true_landmarks
-    )
+    instants = comparison.instants_ns
+    blocks = {
+        "imu": sequence.imu.rows(ends),
+        "dvl": sequence.dvl.rows(ends),
+        "truth": sequence.truth,
+        "true_landmarks": sequence.true_landmarks,
+        "detections": sequence.detections,
+        "instants_ns": instants,
+    }
+    arrays = _packed(blocks)
     if sequence.truth is not None and np.isnan(sequence.truth.covariances).all():
         del arrays["truth.covariances"]  # they would be most of the file
-    arrays |= _pack("detections", sequence.detections) | {
-        "instants_ns": comparison.instants_ns
-    }
     _write_arrays(folder / SEQUENCE, arrays)
     # by name, since tools look up one run
     entries = {}
@@ -176,8 +172,6 @@ def _write(comparison: Comparison, folder: Path) -> None:
         from sonar_graph.recognition import write_recognition
 
         write_recognition(comparison.recognition, folder)
-    sequence = comparison.sequence
-    instants = comparison.instants_ns
     index = {
         "format": FORMAT,
         "sequence": {
@@ -199,19 +193,31 @@ def _write(comparison: Comparison, folder: Path) -> None:
 
 def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
     """The files of one run: trajectories and map for other tools, and all arrays."""
-    if (
-        run.smoothed is not None
-        and run.causal is not None
-        and run.landmarks is not None
-    ):
-        write_tum(folder / "trajectory.tum", run.smoothed)
-        write_tum(folder / "causal.tum", run.causal)
-        write_landmarks_csv(folder / "landmarks.csv", run.landmarks)
+    if (estimates := _estimates(run)) is not None:
+        causal, smoothed, landmarks = estimates
+        write_tum(folder / "trajectory.tum", smoothed)
+        write_tum(folder / "causal.tum", causal)
+        write_landmarks_csv(folder / "landmarks.csv", landmarks)
     if run.known_map is not None:
         write_map(folder / "map.toml", run.known_map)
-    _write_arrays(
-        folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {}))
-    )
+    errors = comparison.errors.get(run.estimator, {})
+    blocks: dict[str, Any] = {"update_s": run.update_s}
+    for kind in KINDS:
+        blocks |= {kind: getattr(run, kind), f"errors.{kind}": errors.get(kind)}
+    for number, known in enumerate(run.maps):
+        place = f"maps.{number}"
+        blocks |= {f"{place}.stamp_ns": known.stamp_ns, place: known.landmarks}
+    for name in RefusedRow._fields:
+        blocks[f"refused.{name}"] = [getattr(row, name) for row in run.refused]
+    blocks |= {"landmarks": run.landmarks, "detections": run.detections}
+    _write_arrays(folder / SERIES, _packed(blocks))
+
+
+def _estimates(run: RunResult) -> tuple[Trajectory, Trajectory, LandmarkMap] | None:
+    """Causal path, smoothed path and map; None where one is missing."""
+    if run.causal is None or run.smoothed is None or run.landmarks is None:
+        return None
+    return run.causal, run.smoothed, run.landmarks
 
 
 def write_viewer_files(comparison: Comparison, folder: Path) -> None:
@@ -225,11 +231,9 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
         When a file cannot be written, or a stamp does not fit into a ROS 2 message.
     """
     estimates = {
-        run.estimator: (run.causal, run.smoothed, run.landmarks)
+        run.estimator: known
         for run in comparison.runs
-        if run.causal is not None
-        and run.smoothed is not None
-        and run.landmarks is not None
+        if (known := _estimates(run)) is not None
     }
     # viewers show the pictures along the time of the run
     drawn = comparison.recognition.pictures if comparison.recognition else []
@@ -300,13 +304,12 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
             for key, score in entry["scores"].items()
         }
         scores[name] = ByName(restored)
-        series = {
-            kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS
-        }
         # without a truth no run has errors, not even none
         if len(of_sequence.get("truth.stamps_ns", ())):
             errors[name] = {
-                kind: known for kind, known in series.items() if known is not None
+                kind: series
+                for kind in KINDS
+                if (series := _unpack(f"errors.{kind}", ErrorSeries, arrays))
             }
     recognition = None
     if (folder / RECOGNITION).is_file():
@@ -373,10 +376,9 @@ def _restore_sequence(
         raise EvaluationError(
             "sequence.npz: the first and last rows of imu and dvl are missing"
         )
-    if "truth.stamps_ns" in arrays and "truth.covariances" not in arrays:
-        arrays = arrays | {
-            "truth.covariances": np.full((len(arrays["truth.stamps_ns"]), 6, 6), np.nan)
-        }
+    if "truth.stamps_ns" in arrays:
+        unknown = np.full((len(arrays["truth.stamps_ns"]), 6, 6), np.nan)
+        arrays = {"truth.covariances": unknown} | arrays
     return Sequence(
         name,
         calibration,
@@ -386,26 +388,6 @@ def _restore_sequence(
         truth=_unpack("truth", Trajectory, arrays),
         true_landmarks=_unpack("true_landmarks", LandmarkMap, arrays),
         notes=notes,
-    )
-
-
-def _run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
-    """All arrays of one run, and its errors."""
-    arrays = {"update_s": run.update_s}
-    for kind in KINDS:
-        arrays |= _pack(kind, getattr(run, kind)) | _pack(
-            f"errors.{kind}", errors.get(kind)
-        )
-    for number, known in enumerate(run.maps):
-        arrays |= {f"maps.{number}.stamp_ns": np.asarray(known.stamp_ns)} | _pack(
-            f"maps.{number}", known.landmarks
-        )
-    arrays |= {
-        f"refused.{name}": np.array([getattr(row, name) for row in run.refused])
-        for name in RefusedRow._fields
-    }
-    return (
-        arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
     )
 
 
@@ -442,42 +424,39 @@ def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
     )
 
 
-def _pack(prefix: str, record: Any) -> Arrays:
-    """The fields of a dataclass as arrays; nothing for None."""
-    if record is None:
-        return {}
-    return {
-        f"{prefix}.{field.name}": np.asarray(getattr(record, field.name))
-        for field in fields(record)
-    }
+def _packed(blocks: dict[str, Any]) -> Arrays:
+    """Values as arrays, of a dataclass one for each field; nothing for None."""
+    arrays: Arrays = {}
+    for name, block in blocks.items():
+        if is_dataclass(block):
+            for field in fields(block):
+                arrays[f"{name}.{field.name}"] = np.asarray(getattr(block, field.name))
+        elif block is not None:
+            arrays[name] = np.asarray(block)
+    return arrays
 
 
 def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
-    """The dataclass whose fields `_pack` stored; None where it was absent.
+    """The dataclass whose fields `_packed` stored; None where it was absent.
 
     Raises `EvaluationError` naming the field that is missing.
     """
     # fields with a default may be missing: an older version did not have them
-    columns = fields(kind)  # type: ignore[arg-type]  # every kind here is a dataclass
-    stored = {
-        column.name: arrays[key]
-        for column in columns
-        if (key := f"{prefix}.{column.name}") in arrays
-    }
-    if not stored:
+    values: dict[str, Any] = {}
+    missing = []
+    for column in fields(kind):  # type: ignore[arg-type]  # every kind here is a dataclass
+        array = arrays.get(f"{prefix}.{column.name}")
+        if array is not None:
+            # numbers were stored as arrays without dimensions
+            values[column.name] = array.item() if array.ndim == 0 else array
+        elif column.default_factory is MISSING:
+            missing.append(column.name)
+    if not values:
         return None
-    missing = [
-        c.name for c in columns if c.name not in stored and c.default_factory is MISSING
-    ]
     if missing:
         raise EvaluationError(
             f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew"
         )
-    values: dict[str, Any] = {
-        # numbers were stored as arrays without dimensions
-        name: array.item() if array.ndim == 0 else array
-        for name, array in stored.items()
-    }
     # npz has no enumerations: outcomes are stored as texts
     if "outcomes" in values:
         values["outcomes"] = [Outcome(text) for text in values["outcomes"].tolist()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -73,9 +74,8 @@ HEADLINES = {
     "ate_raw_m": "RMS, not aligned",
 }
 """Position errors that can stand in the headline, best suited first, with their names there."""
-# scores of the compact table after the position errors, most important first
+# scores of the compact table after the errors of positions and map, most important first
 COMPACT = {
-    "landmarks.{map_metric}": "Map error",
     "causal.nees_position": "Position NEES",
     "causal.nees_yaw": "Yaw NEES",
     "causal.yaw_rmse_rad": "Yaw error",
@@ -96,11 +96,8 @@ DIRECTIONS = {
 
 def unaligned(sequence: Sequence) -> str:
     """Words for scores and pictures in which no run is aligned; the truth may have been, once for all runs."""
-    return (
-        "the truth brought into the estimates' world"
-        if FITTED in sequence.notes
-        else NOT_ALIGNED
-    )
+    is_fitted = FITTED in sequence.notes
+    return "the truth brought into the estimates' world" if is_fitted else NOT_ALIGNED
 
 
 def label(metric: str, comparison: Comparison, labels: dict[str, str] = LABELS) -> str:
@@ -110,35 +107,30 @@ def label(metric: str, comparison: Comparison, labels: dict[str, str] = LABELS) 
 
 def score_keys(comparison: Comparison) -> list[str]:
     """All keys of scores in the order of the table: known ones as in `BLOCKS` and `LABELS`, then others by name."""
+    blocks = {name: place for place, name in enumerate(BLOCKS)}
+    metrics = {name: place for place, name in enumerate(LABELS)}
 
-    def place(names: list[str], name: str) -> int:
-        return names.index(name) if name in names else len(names)
+    def place(key: str) -> tuple[float, float, str]:
+        block, _, metric = key.partition(".")
+        return blocks.get(block, math.inf), metrics.get(metric, math.inf), key
 
-    keys = {key for scores in comparison.scores.values() for key in scores}
-    blocks = list(BLOCKS)
-    metrics = list(LABELS)
-    return sorted(
-        keys,
-        key=lambda key: (
-            place(blocks, key.partition(".")[0]),
-            place(metrics, key.partition(".")[2]),
-            key,
-        ),
-    )
+    return sorted(set[str]().union(*comparison.scores.values()), key=place)
 
 
 def headline_metric(comparison: Comparison) -> str | None:
     """The position error that most runs have, without its ``causal.`` or ``smoothed.``; None where no run has one."""
+
     # runs may lack different errors: the headline is about the one that most have
-    counts = {
-        metric: sum(
-            comparison.score_of(run.estimator, f"causal.{metric}") is not None
-            for run in comparison.runs
-        )
-        for metric in HEADLINES
-    }
-    best = max(counts, key=lambda metric: counts[metric])
-    return best if counts[best] else None
+    def count(metric: str) -> int:
+        return len(list(filter(None, scores_of(comparison, f"causal.{metric}"))))
+
+    best = max(HEADLINES, key=count)
+    return best if count(best) else None
+
+
+def scores_of(comparison: Comparison, key: str) -> list[Score | None]:
+    """One score of each run; None where a run lacks it, or it is not a number."""
+    return [comparison.score_of(run.estimator, key) for run in comparison.runs]
 
 
 def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
@@ -163,33 +155,32 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
         f"causal.{metric}": f"Position error, {world}",
         f"smoothed.{metric}": f"Smoothed, {world}",
     }
-    map_metric = "se2_m" if aligned else "raw_m"
-    for key, heading in COMPACT.items():
-        is_map = key.startswith("landmarks.")
-        headings[key.format(map_metric=map_metric)] = (
-            f"{heading}, {world}" if is_map else heading
-        )
+    headings[f"landmarks.{'se2_m' if aligned else 'raw_m'}"] = f"Map error, {world}"
     columns = [Column("estimator", "Estimator", is_number=False)]
-    for key, heading in headings.items():
-        found = [comparison.score_of(run.estimator, key) for run in comparison.runs]
+    # whoever compares must see that a filter lacks what its neighbours have
+    rows = [
+        [
+            replace(
+                words(run.estimator, run=index),
+                note=AS_PUBLISHED if run.is_as_published else "",
+            )
+        ]
+        for index, run in enumerate(comparison.runs)
+    ]
+    for key, heading in (headings | COMPACT).items():
+        found = scores_of(comparison, key)
         # a column of dashes takes the place of one with numbers
-        known = [score for score in found if score is not None]
-        if known and len(columns) <= MOST_SCORES:
-            unit = f" ({known[0].shown_unit})" if known[0].shown_unit else ""
-            columns.append(Column(key, heading + unit))
-    rows = []
-    for index, run in enumerate(comparison.runs):
-        # whoever compares must see that it lacks what its neighbours have
-        note = AS_PUBLISHED if run.is_as_published else ""
-        cells = [replace(words(run.estimator, run=index), note=note)]
-        for column in columns[1:]:
-            score = comparison.score_of(run.estimator, column.key)
+        known = next(filter(None, found), None)
+        if known is None or len(columns) > MOST_SCORES:
+            continue
+        unit = f" ({known.shown_unit})" if known.shown_unit else ""
+        columns.append(Column(key, heading + unit))
+        for row, score in zip(rows, found, strict=True):
             if score is None:
-                cells.append(absent())
+                row.append(absent())
                 continue
             verdict = "" if score.verdict == "consistent" else score.verdict
-            cells.append(number(score.value, score.text(), note=verdict))
-        rows.append(cells)
+            row.append(number(score.value, score.text(), note=verdict))
     caption = (
         f"Position error: {label(metric, comparison, HEADLINES)}, causal. NEES 1: covariances fit."
         if metric
@@ -236,34 +227,19 @@ def score_table(comparison: Comparison) -> Table:
         # one interval for all stands in the last column, others beside their values
         intervals = {_expected(score) for score in known}
         common = intervals.pop() if len(intervals) == 1 else ""
-        cells = []
+        name = label(metric, comparison) if metric in LABELS else key
+        row = [words(name), words(known[0].shown_unit)]
         for score in scores:
             if score is None:
-                cells.append(Cell(ABSENT))
+                row.append(Cell(ABSENT))
                 continue
             own = "" if common else _expected(score)
-            cells.append(
-                Cell(
-                    score.text(),
-                    (score.value,),
-                    note="; ".join(filter(None, [score.verdict, own])),
-                )
-            )
-        direction = DIRECTIONS[known[0].better]
-        reading = (
-            f"{direction}; {common}" if direction and common else direction + common
-        )
-        rows.append(
-            [
-                words(label(metric, comparison) if metric in LABELS else key),
-                words(known[0].shown_unit),
-                *cells,
-                words(reading),
-            ]
-        )
-    return Table(
-        "scores", "Scores by metric and estimator", "", columns, rows, sections
-    )
+            note = "; ".join(filter(None, [score.verdict, own]))
+            row.append(Cell(score.text(), (score.value,), note))
+        reading = filter(None, [DIRECTIONS[known[0].better], common])
+        rows.append([*row, words("; ".join(reading))])
+    title = "Scores by metric and estimator"
+    return Table("scores", title, "", columns, rows, sections)
 
 
 def _expected(score: Score) -> str:

@@ -4,6 +4,8 @@ Each log has a panel with its own scale and a line for each contestant, which ke
 """
 
 import math
+from itertools import product
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +20,7 @@ from sonar_graph.report.batch_tables import unit_of
 ROW_IN = 0.36
 PANEL_IN = 0.95
 KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
-FILLED = {"": True, "Causal": True, "Smoothed": False}
+
 SMALL = 9.0
 
 
@@ -44,40 +46,28 @@ def log_panels(
     return figure, panels
 
 
-def spread_out(panel: Axes) -> None:
-    """A logarithmic scale with numbers at 1, 2 and 5 of each power of ten."""
-    style.logarithmic(panel, "x")
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-
-
 def spread_drawing(batch: RecordedBatch, metric: Metric) -> style.Illustration | None:
     """Every run's value as a dot, with the median and the middle 80 %."""
-    logs = [
-        log
-        for log in batch.logs
-        if any(_finite(batch, log, name, metric).size for name in batch.contestants)
-    ]
-    if not logs:
+    found = {log: _finite(batch, log, metric) for log in batch.logs}
+    found = {log: values for log, values in found.items() if values.size}
+    if not found:
         return None
-    figure, panels = log_panels(batch, logs, f"{metric.label}{unit_of(metric)}")
-    for panel, log in zip(panels, logs, strict=True):
-        values = np.concatenate(
-            [_finite(batch, log, name, metric) for name in batch.contestants]
-        )
+    label = f"{metric.label}{unit_of(metric)}"
+    figure, panels = log_panels(batch, list(found), label)
+    for panel, (log, values) in zip(panels, found.items(), strict=True):
         # a logarithmic scale for errors that differ by a power of ten, where a linear one would hide the
         # small ones
         if values.min() > 0 and values.max() > SMALL * values.min():
-            spread_out(panel)
+            style.logarithmic(panel, "x")
+            panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         for place, contestant in enumerate(batch.contestants):
             for over, key in metric.keys.items():
-                _draw_spread(
-                    panel,
-                    batch.values(log, contestant, key) * metric.factor,
-                    place,
-                    over,
-                )
+                own = batch.values(log, contestant, key) * metric.factor
+                _draw_spread(panel, own, place, over)
+    kinds = "Full dots, above: causal; hollow, below: smoothed. "
     caption = (
-        f"{metric.protocol} A dot is a run, the stroke their median, the bar the middle 80 %. {_kinds_told(metric)}"
+        f"{metric.protocol} A dot is a run, the stroke their median, the bar the middle 80 %. "
+        f"{'' if '' in metric.keys else kinds}"
         "Runs without a value have no dot; their number stands at the right."
     )
     name = f"spread-{metric.name}".replace("_", "-")
@@ -93,51 +83,26 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
         return
     # an infinite end would draw a bar to the edge, which looks like a value
     inside = [quantile(values, share) for share in (0.1, 0.9)]
+    look: dict[str, Any] = {"linewidth": 7, "alpha": 0.3, "solid_capstyle": "butt"}
     if all(map(math.isfinite, inside)) and len(values) > 1:
-        panel.plot(
-            inside, [row, row], color=own, alpha=0.3, linewidth=7, solid_capstyle="butt"
-        )
+        panel.plot(inside, [row, row], color=own, **look)
     # dots of equal values stand beside each other
     shifts = row + 0.05 * np.cos(2.4 * np.arange(len(known)))
-    panel.plot(
-        known,
-        shifts,
-        "o",
-        color=own,
-        markersize=3.6,
-        markerfacecolor=own if FILLED[over] else "none",
-    )
+    filled = "none" if over == "Smoothed" else own
+    panel.plot(known, shifts, "o", color=own, markersize=3.6, markerfacecolor=filled)
     middle = quantile(values, 0.5)
     if math.isfinite(middle):
-        panel.plot(
-            middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6
-        )
+        look = {"color": style.INK, "markersize": 12, "markeredgewidth": 1.6}
+        panel.plot(middle, row, "|", **look)
     # a dot that is missing must not look like a run that is missing
     if len(known) < len(values):
-        across = panel.get_yaxis_transform()
         note = f"{len(values) - len(known)} without"
-        panel.text(
-            1.01,
-            row,
-            note,
-            transform=across,
-            ha="left",
-            va="center",
-            color=style.MUTED,
-            fontsize="small",
-        )
+        look = {"color": style.MUTED, "fontsize": "small", "ha": "left", "va": "center"}
+        panel.text(1.01, row, note, transform=panel.get_yaxis_transform(), **look)
 
 
-def _finite(batch: RecordedBatch, log: str, contestant: str, metric: Metric) -> Floats:
-    values = np.concatenate(
-        [batch.values(log, contestant, key) for key in metric.keys.values()]
-    )
+def _finite(batch: RecordedBatch, log: str, metric: Metric) -> Floats:
+    """The finite values of all runs on a log, of both estimates."""
+    places = product(batch.contestants, metric.keys.values())
+    values = np.concatenate([batch.values(log, name, key) for name, key in places])
     return np.asarray(values[np.isfinite(values)])
-
-
-def _kinds_told(metric: Metric) -> str:
-    return (
-        ""
-        if "" in metric.keys
-        else "Full dots, above: causal; hollow, below: smoothed. "
-    )

@@ -1,6 +1,7 @@
 """The report of a batch: one HTML page that needs nothing but itself. Explanations: ``templates/batch.html``."""
 
 from collections import Counter
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -43,23 +44,25 @@ def write_batch_report(
     -------
     Path of the page.
     """
-    with sized():
-        content = batch_content(batch)
+    sections, content = _page(batch)
     with result_written(folder, BATCH, overwrite=overwrite):
         write_tables(content["tables"], folder)
-        return write_html(folder / PAGE, "batch", sections_of(content), content)
-
-
-def sections_of(content: dict[str, Any]) -> list[PageSection]:
-    """The sections of the page: without that of errors where no run has any."""
-    return [one for one in SECTIONS if content["chapters"] or one.anchor != "errors"]
+        return write_html(folder / PAGE, "batch", sections, content)
 
 
 def render_batch(batch: RecordedBatch) -> str:
     """The page as text."""
+    return html_of("batch", *_page(batch))
+
+
+def _page(batch: RecordedBatch) -> tuple[list[PageSection], dict[str, Any]]:
+    """The sections of the page, without that of errors where no run has any, and the values that their macros use."""
     with sized():
         content = batch_content(batch)
-    return html_of("batch", sections_of(content), content)
+    sections = (
+        one for one in SECTIONS if content["chapters"] or one.anchor != "errors"
+    )
+    return list(sections), content
 
 
 def batch_content(batch: RecordedBatch) -> dict[str, Any]:
@@ -67,14 +70,9 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     metrics = metrics_of(batch.metrics)
     tests = tables.all_tests(batch, metrics)
     # a metric is a chapter only where some run can have it
-    groups = [(log, name) for log in batch.logs for name in batch.contestants]
     chapters: list[dict[str, Any]] = []
     for metric in metrics:
-        if any(
-            batch.is_asked(log, name, key)
-            for key in metric.keys.values()
-            for log, name in groups
-        ):
+        if any(summary.is_asked(batch, log, metric) for log in batch.logs):
             both = [
                 tables.accuracy_table(batch, metric),
                 tables.difference_table(batch, metric, tests),
@@ -88,19 +86,14 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
                     ],
                 }
             )
-    head = summary.head_metric(batch, metrics)
-    overview = (
-        [summary.marked(batch, summary.overview_table(batch, head, tests))]
-        if head
-        else []
-    )
-    others = (
-        tables.failure_table(batch),
-        tables.consistency_table(batch),
-    )
     # tables leave the page as files, and must state there too what is missing
-    failures, consistency = (summary.marked(batch, table) for table in others)
+    overview = None
+    if head := summary.head_metric(batch, metrics):
+        overview = summary.marked(batch, summary.overview_table(batch, head, tests))
+    failures = summary.marked(batch, tables.failure_table(batch))
+    consistency = summary.marked(batch, tables.consistency_table(batch))
     # logs may have different numbers of seeds
+    groups = product(batch.logs, batch.contestants)
     seeds = max(len(batch.group(log, name)) for log, name in groups)
     settings: dict[str, str] = {}
     for column, name in (
@@ -115,12 +108,10 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     for name in ORIGINS:
         # a batch that was resumed on another machine has several values
         counts = Counter(run.texts[name] for run in batch.runs if name in run.texts)
-        if counts:
-            many = len(counts) > 1
-            origins[name] = [
-                f"{text} ({count} runs)" if many else text
-                for text, count in counts.items()
-            ]
+        if len(counts) > 1:
+            origins[name] = [f"{text} ({n} runs)" for text, n in counts.items()]
+        elif counts:
+            origins[name] = list(counts)
     return {
         "name": batch.name,
         "names": batch.contestants,
@@ -136,11 +127,8 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
             *summary.sensors_told(batch),
             *summary.withheld_told(batch),
         ],
-        "warnings": [
-            *summary.reference_told(batch),
-            *summary.instants_told(batch),
-        ],
-        "overview": overview[0] if overview else None,
+        "warnings": [*summary.reference_told(batch), *summary.instants_told(batch)],
+        "overview": overview,
         "folded_rows": FOLDED_ROWS,
         "estimates": [f"{sentence}." for sentence in ESTIMATES.values()],
         "failures": failures,
@@ -148,7 +136,7 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
         "chapters": chapters,
         "consistency": consistency,
         "tables": [
-            *overview,
+            *filter(None, [overview]),
             failures,
             *(one for chapter in chapters for one in chapter["tables"]),
             consistency,

@@ -6,6 +6,7 @@ Failures and missing runs come first, then warnings, then errors against the ref
 import math
 from collections import Counter
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from sonar_graph.report.batch_tables import (
     Tests,
     shown,
     unit_of,
+    without_value,
 )
 from sonar_graph.states import counted
 from sonar_graph.table import Cell, Column, Table, absent, number, words
@@ -52,11 +54,11 @@ def failures_told(batch: RecordedBatch) -> list[str]:
 def reference_told(batch: RecordedBatch) -> list[str]:
     """A warning where the reference never ended: differences then show its failure and nothing else."""
     # a reference that failed makes every difference infinite
-    groups = {log: batch.group(log, batch.reference) for log in batch.logs}
     lost = [
         log
-        for log, group in groups.items()
-        if group and not any(run.ended for run in group)
+        for log in batch.logs
+        if (group := batch.group(log, batch.reference))
+        and not any(run.ended for run in group)
     ]
     if not lost:
         return []
@@ -68,17 +70,17 @@ def reference_told(batch: RecordedBatch) -> list[str]:
 
 def instants_told(batch: RecordedBatch) -> list[str]:
     """A warning where runs with the same log and seed are scored at different instants."""
-    uneven = []
-    for log in batch.logs:
-        counts: dict[int | None, set[float]] = {}
-        for run in batch.runs:
-            if run.log == log and run.ended and SCORED in run.values:
-                # other instants are another question: easy stretches may be missing in one run
-                counts.setdefault(run.seed, set()).add(run.values[SCORED])
-        if any(len(known) > 1 for known in counts.values()):
-            uneven.append(log)
-    if not uneven:
+    # other instants are another question: easy stretches may be missing in one run
+    counts = {
+        (run.log, run.seed, run.values[SCORED])
+        for run in batch.runs
+        if run.ended and SCORED in run.values
+    }
+    seeds = Counter((log, seed) for log, seed, _ in counts)
+    lost = {log for (log, _), number in seeds.items() if number > 1}
+    if not lost:
         return []
+    uneven = [log for log in batch.logs if log in lost]
     return [
         f"Scored at different numbers of instants, which differences then mix in: {_few(uneven)}."
     ]
@@ -93,25 +95,19 @@ def _few(names: list[str], joint: str = ", ") -> str:
 def head_metric(batch: RecordedBatch, metrics: list[Metric]) -> Metric | None:
     """The error that most logs have, of those the one that the suite names first; None where no run has an error."""
 
-    def has(log: str, metric: Metric) -> bool:
-        return any(
-            batch.is_asked(log, name, key)
-            for key in metric.keys.values()
-            for name in batch.contestants
-        )
+    def logs_with(metric: Metric) -> int:
+        return sum(is_asked(batch, log, metric) for log in batch.logs)
 
     # an error that one log has is no headline for many
-    logs = {
-        metric.name: sum(has(log, metric) for log in batch.logs)
-        for metric in metrics
-        if metric.is_error
-    }
-    if not any(logs.values()):
-        return None
-    return max(
-        (metric for metric in metrics if metric.is_error),
-        key=lambda metric: logs[metric.name],
-    )
+    errors = [metric for metric in metrics if metric.is_error]
+    best = max(errors, key=logs_with, default=None)
+    return best if best and logs_with(best) else None
+
+
+def is_asked(batch: RecordedBatch, log: str, metric: Metric) -> bool:
+    """True where some run on a log can have a metric."""
+    places = product(batch.contestants, metric.keys.values())
+    return any(batch.is_asked(log, name, key) for name, key in places)
 
 
 def mark_of(found: tuple[PairedDifference, float] | None) -> str:
@@ -120,13 +116,9 @@ def mark_of(found: tuple[PairedDifference, float] | None) -> str:
         return ""
     # the rank test is about the side of most differences; one lost run can turn the mean
     median = found[0].median
-    return (
-        DIFFERENT
-        if math.isnan(median) or median == 0
-        else LOWER
-        if median < 0
-        else HIGHER
-    )
+    if math.isnan(median) or median == 0:
+        return DIFFERENT
+    return LOWER if median < 0 else HIGHER
 
 
 def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
@@ -152,27 +144,16 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             # medians, because a mean over a group with a lost run does not exist
             told = summarise(batch.values(log, name, key))
             found = tests.get((key, log, name))
-            text = shown(told.median * metric.factor)
-            note = (
-                f"{told.without} of {told.runs} without a value" if told.without else ""
-            )
+            text = f"{shown(told.median * metric.factor)} {mark_of(found)}".rstrip()
             p_value = found[1] if found else math.nan
-            rows[-1].append(
-                number(
-                    told.median, f"{text} {mark_of(found)}".rstrip(), p_value, note=note
-                )
-            )
+            note = without_value(told)
+            rows[-1].append(number(told.median, text, p_value, note=note))
     caption = (
         f"{LOWER} lower, {HIGHER} higher than {batch.reference} on the same seeds, beyond chance "
         f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart.{too_few(metric, tests)}"
     )
-    return Table(
-        "overview",
-        f"{metric.label}{unit_of(metric)}, median over runs",
-        caption,
-        columns,
-        rows,
-    )
+    title = f"{metric.label}{unit_of(metric)}, median over runs"
+    return Table("overview", title, caption, columns, rows)
 
 
 def too_few(metric: Metric, tests: Tests) -> str:
@@ -196,22 +177,17 @@ def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:
     """Contestants that have the estimate; the smoothed one only where it is not the causal one everywhere."""
     key = metric.keys[over]
     first = next(iter(metric.keys.values()))
-    asked = [
-        name
-        for name in batch.contestants
-        if any(batch.is_asked(log, name, key) for log in batch.logs)
-    ]
-    # the causal estimate is always shown: a vehicle acts on it
-    if key == first:
-        return asked
-    return [
-        name
-        for name in asked
-        if not all(
+
+    def is_shown(name: str) -> bool:
+        if not any(batch.is_asked(log, name, key) for log in batch.logs):
+            return False
+        # the causal estimate is always shown: a vehicle acts on it
+        return key == first or not all(
             np.array_equal(batch.values(log, name, key), batch.values(log, name, first))
             for log in batch.logs
         )
-    ]
+
+    return list(filter(is_shown, batch.contestants))
 
 
 def missing_told(batch: RecordedBatch) -> list[str]:
@@ -238,14 +214,12 @@ def sensors_told(batch: RecordedBatch) -> list[str]:
     # grave findings first: they put all numbers of the log in doubt
     words = {"doubtful": "Doubtful", "sensors": "Warning"}
     found = {
-        (subject, run.log): run.texts[subject]
-        for subject in words
+        (word, run.log): run.texts[subject]
+        for subject, word in words.items()
         for run in batch.runs
         if subject in run.texts
     }
-    return [
-        f"{words[subject]}: {log}: {text}" for (subject, log), text in found.items()
-    ]
+    return [f"{word}: {log}: {text}" for (word, log), text in found.items()]
 
 
 def withheld_told(batch: RecordedBatch) -> list[str]:
@@ -282,7 +256,7 @@ def lost_told(batch: RecordedBatch) -> list[str]:
     if not lost:
         return []
     return [
-        f"The table has {len(lost)} {'run' if len(lost) == 1 else 'runs'} whose folder is not here, first {lost[0]}: "
+        f"The table has {counted(len(lost), 'run')} whose folder is not here, first {lost[0]}: "
         "their numbers can be told and not be followed. Where it was removed, the bench command does them anew."
     ]
 
@@ -291,6 +265,5 @@ def marked(batch: RecordedBatch, table: Table) -> Table:
     """The table, whose caption names missing runs: tables are also used outside the page."""
     if not batch.missing:
         return table
-    return replace(
-        table, caption=f"{table.caption} Not complete: {batch.missing_count}.".lstrip()
-    )
+    caption = f"{table.caption} Not complete: {batch.missing_count}.".lstrip()
+    return replace(table, caption=caption)

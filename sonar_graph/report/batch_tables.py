@@ -4,8 +4,10 @@ Statistics: `sonar_graph.batch`. A metric is a family of tests, corrected by Hol
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 
@@ -49,10 +51,9 @@ def group_cells(batch: RecordedBatch, log: str, contestant: str) -> list[Cell]:
 
 def groups_of(batch: RecordedBatch) -> Iterator[tuple[str, str, list[RecordedRun]]]:
     """Log, contestant and their runs, where there are any."""
-    for log in batch.logs:
-        for contestant in batch.contestants:
-            if group := batch.group(log, contestant):
-                yield log, contestant, group
+    for log, contestant in product(batch.logs, batch.contestants):
+        if group := batch.group(log, contestant):
+            yield log, contestant, group
 
 
 def shown(value: float) -> str:
@@ -74,31 +75,21 @@ def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
         # significance
         distinct: dict[tuple[str, str, bytes, bytes], PairedDifference] = {}
         same = {}
-        for key in metric.keys.values():
-            for log in _compared_logs(batch):
-                for contestant in batch.contestants:
-                    own, other = batch.pairs(log, contestant, key)
-                    if contestant == batch.reference or not len(own):
-                        continue
-                    place = same[key, log, contestant] = (
-                        log,
-                        contestant,
-                        own.tobytes(),
-                        other.tobytes(),
-                    )
-                    if place not in distinct:
-                        cases = (
-                            batch.cases(log, contestant, key)
-                            if log == ALL_LOGS
-                            else None
-                        )
-                        distinct[place] = paired(own, other, cases)
+        places = product(metric.keys.values(), _compared_logs(batch), batch.contestants)
+        for key, log, contestant in places:
+            own, other = batch.pairs(log, contestant, key)
+            if contestant == batch.reference or not len(own):
+                continue
+            numbers = (log, contestant, own.tobytes(), other.tobytes())
+            same[key, log, contestant] = numbers
+            if numbers not in distinct:
+                is_all = log == ALL_LOGS
+                cases = batch.cases(log, contestant, key) if is_all else None
+                distinct[numbers] = paired(own, other, cases)
         p_values = holm(np.array([test.p_value for test in distinct.values()])).tolist()
         corrected = dict(zip(distinct, p_values, strict=True))
-        tests |= {
-            place: (distinct[numbers], corrected[numbers])
-            for place, numbers in same.items()
-        }
+        for place, numbers in same.items():
+            tests[place] = (distinct[numbers], corrected[numbers])
     return tests
 
 
@@ -118,38 +109,25 @@ def failure_table(batch: RecordedBatch) -> Table:
     ]
     missing = Counter((run.log, run.contestant) for run in batch.missing)
     rows = []
-    for log in batch.logs:
-        for contestant in batch.contestants:
-            group = batch.group(log, contestant)
-            not_run = missing[log, contestant]
-            if not group and not not_run:
-                continue
-            # a group that is planned and not begun has a row, or it would be overlooked
-            cells = [count(0), *[absent()] * (1 + len(FAILURES)), absent(3)]
-            if group:
-                counts = Counter(run.status for run in group)
-                rate = failure_rate(len(group) - counts["ok"], len(group))
-                interval = f"{100 * rate.low:.0f} to {100 * rate.high:.0f} %"
-                cells = [
-                    count(len(group)),
-                    *(count(counts[status]) for status in ("ok", *FAILURES)),
-                ]
-                cells.append(
-                    Cell(
-                        f"{100 * rate.share:.0f} %",
-                        (rate.share, rate.low, rate.high),
-                        interval,
-                    )
-                )
-            cells += [count(not_run)] if batch.missing else []
-            rows.append([*group_cells(batch, log, contestant), *cells])
-    return Table(
-        "failures",
-        "Runs that ended",
-        "Rates with 95 % intervals (Wilson).",
-        columns,
-        rows,
-    )
+    for log, contestant in product(batch.logs, batch.contestants):
+        group = batch.group(log, contestant)
+        not_run = missing[log, contestant]
+        if not group and not not_run:
+            continue
+        # a group that is planned and not begun has a row, or it would be overlooked
+        cells = [count(0), *[absent()] * (1 + len(FAILURES)), absent(3)]
+        if group:
+            counts = Counter(run.status for run in group)
+            rate = failure_rate(len(group) - counts["ok"], len(group))
+            share = f"{100 * rate.share:.0f} %"
+            interval = f"{100 * rate.low:.0f} to {100 * rate.high:.0f} %"
+            cells = [count(counts[status]) for status in ("ok", *FAILURES)]
+            cells.insert(0, count(len(group)))
+            cells.append(Cell(share, (rate.share, rate.low, rate.high), interval))
+        cells += [count(not_run)] if batch.missing else []
+        rows.append([*group_cells(batch, log, contestant), *cells])
+    caption = "Rates with 95 % intervals (Wilson)."
+    return Table("failures", "Runs that ended", caption, columns, rows)
 
 
 def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
@@ -164,29 +142,35 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
     rows = []
     for log, contestant, group in groups_of(batch):
         # beside the count, because the mean is missing for this reason
-        failed = sum(not run.ended for run in group)
-        row = [
-            *group_cells(batch, log, contestant),
-            count(len(group), f"{failed} failed" if failed else ""),
-        ]
+        failed = failed_of(group, "failed")
+        row = [*group_cells(batch, log, contestant), count(len(group), failed)]
         for key in metric.keys.values():
             if batch.is_asked(log, contestant, key):
-                row += summary_cells(
-                    summarise(batch.values(log, contestant, key)), metric.factor
-                )
+                told = summarise(batch.values(log, contestant, key))
+                row += summary_cells(told, metric.factor)
             else:
                 row += [absent(2), absent(), absent(2)]
         rows.append(row)
     return _metric_table("accuracy", metric, _unit_note(metric), columns, rows)
 
 
-def summary_cells(told: SampleSummary, factor: float = 1.0) -> list[Cell]:
+def failed_of(group: list[RecordedRun], what: str) -> str:
+    """The number of runs that did not end, with a word; empty where all did."""
+    failed = sum(not run.ended for run in group)
+    return f"{failed} {what}" if failed else ""
+
+
+def without_value(told: SampleSummary) -> str:
+    """The number of runs without a value; empty where all have one."""
+    return f"{told.without} of {told.runs} without a value" if told.without else ""
+
+
+def summary_cells(told: SampleSummary, factor: float) -> list[Cell]:
     """Mean with its error, median, and range of the middle 80 %."""
-    note = f"{told.without} of {told.runs} without a value" if told.without else ""
     text = shown(told.mean * factor)
     if math.isfinite(told.standard_error):
         text += f" ± {shown(told.standard_error * factor)}"
-    mean = number(told.mean, text, told.standard_error, note=note)
+    mean = number(told.mean, text, told.standard_error, note=without_value(told))
     median = number(told.median, shown(told.median * factor))
     # one run has no spread
     if told.runs == 1:
@@ -206,22 +190,19 @@ def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Tabl
             Column(f"{key}_p_holm", "p (Holm)", over, ("", "single")),
         ]
     rows = []
-    for log in _compared_logs(batch):
-        for contestant in batch.contestants:
-            own = [tests.get((key, log, contestant)) for key in metric.keys.values()]
-            # the first error that there is gives the number of pairs, which is the same for all
-            known = [found[0] for found in own if found is not None]
-            if not known:
-                continue
-            without = max(test.without for test in known)
-            note = f"{without} without a value" if without else ""
-            pairs = Cell(known[0].counted, (known[0].pairs, known[0].each), note=note)
-            cells = [
-                cell
-                for found in own
-                for cell in _difference_cells(found, metric.factor)
-            ]
-            rows.append([*group_cells(batch, log, contestant), pairs, *cells])
+    for log, contestant in product(_compared_logs(batch), batch.contestants):
+        own = [tests.get((key, log, contestant)) for key in metric.keys.values()]
+        # the first error that there is gives the number of pairs, which is the same for all
+        known = [found[0] for found in own if found is not None]
+        if not known:
+            continue
+        without = max(test.without for test in known)
+        note = f"{without} without a value" if without else ""
+        pairs = Cell(known[0].counted, (known[0].pairs, known[0].each), note)
+        row = [*group_cells(batch, log, contestant), pairs]
+        for found in own:
+            row += _difference_cells(found, metric.factor)
+        rows.append(row)
     caption = f"{_unit_note(metric)} Contestant minus {batch.reference}: negative means smaller than the reference."
     return _metric_table("difference", metric, caption, columns, rows)
 
@@ -261,19 +242,16 @@ def _metric_table(
     columns: list[Column],
     rows: list[list[Cell]],
 ) -> Table:
-    prefix = metric.keys[""].partition(".")[0] if "" in metric.keys else ""
-    name = (
-        "-".join(filter(None, [kind, prefix, metric.name]))
-        .replace("_", "-")
-        .replace(".", "-")
-    )
+    prefix = metric.keys.get("", "").partition(".")[0]
+    name = re.sub("[_.]", "-", "-".join(filter(None, [kind, prefix, metric.name])))
     unit = f", {metric.shown_unit}" if metric.shown_unit else ""
     return Table(name, f"{metric.label}{unit}", caption, columns, rows)
 
 
 def _unit_note(metric: Metric) -> str:
+    direction = f" {metric.direction.capitalize()}." if metric.direction else ""
     converted = " Degrees here, radians in the CSV." if metric.unit == "rad" else ""
-    return f"{metric.protocol}{' ' + metric.direction.capitalize() + '.' if metric.direction else ''}{converted}"
+    return f"{metric.protocol}{direction}{converted}"
 
 
 def anees_of(
@@ -286,9 +264,8 @@ def anees_of(
     group = batch.group(log, contestant)
     # runs of one log have the same freedom; else no band is right for their average
     dofs = {run.values[f"{key}_dof"] for run in group if f"{key}_dof" in run.values}
-    return anees(
-        batch.values(log, contestant, key), dofs.pop() if len(dofs) == 1 else math.nan
-    )
+    dof = dofs.pop() if len(dofs) == 1 else math.nan
+    return anees(batch.values(log, contestant, key), dof)
 
 
 def consistency_table(batch: RecordedBatch) -> Table:
@@ -306,18 +283,16 @@ def consistency_table(batch: RecordedBatch) -> Table:
     ]
     rows = []
     for log, contestant, group in groups_of(batch):
-        failed = sum(not run.ended for run in group)
         for what in ("position", "yaw"):
             found = anees_of(batch, log, contestant, what)
             if found is None:
                 continue
             low, high = found.band
-            note = f"{failed} failed: no average" if failed else ""
             rows.append(
                 [
                     *group_cells(batch, log, contestant),
                     words(what),
-                    count(found.runs, note),
+                    count(found.runs, failed_of(group, "failed: no average")),
                     number(low, f"{low:.2f} to {high:.2f}", high),
                     number(found.mean, shown(found.mean)),
                     words(found.verdict),

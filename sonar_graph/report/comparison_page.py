@@ -31,7 +31,7 @@ from sonar_graph.report.given_map import given_map_table
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.rendering import PageSection, data_address, html_of, write_html
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Outcome
+from sonar_graph.states import Outcome, counted
 from sonar_graph.table import ABSENT, Column, Table, text_table, words
 
 PAGE = "report.html"
@@ -157,13 +157,11 @@ def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
         "summary": (
             f"{', '.join(run.estimator for run in runs)} on {format_value(round(sequence.duration_s, 1))} s of "
             f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
-            f"{_counted(detections, 'landmark detection')}."
+            f"{counted(detections, 'landmark detection')}."
         ),
         "headlines": {
             "aligned": sentences.headline(comparison),
-            "raw": ""
-            if aligned is None
-            else sentences.headline(comparison, aligned=False),
+            "raw": sentences.headline(comparison, aligned=False) if aligned else "",
         },
         "published": sentences.published_filters(comparison),
         "remarks": sentences.remarks(comparison),
@@ -228,17 +226,12 @@ def _views(name: str, aligned: Table | None, raw: Table | None) -> dict[str, Tab
 
 def comparison_tables(comparison: Comparison) -> list[Table]:
     """All tables of numbers that the page has, but the compact one."""
-    landmarks = landmark_table(comparison)
-    tables = [
+    tables = (
         score_table(comparison),
-        *([landmarks] if landmarks else []),
+        landmark_table(comparison),
         outcome_table(comparison),
-    ]
-    return [table for table in tables if table.rows]
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+    )
+    return [table for table in tables if table and table.rows]
 
 
 def _as_json(values: Any) -> str:
@@ -255,60 +248,46 @@ def protocols(
     # labels and their order are those of the table
     table = score_table(comparison)
     found: dict[str, list[tuple[str, str, list[tuple[str, str]]]]] = {}
-    for place, (key, row) in enumerate(
-        zip(score_keys(comparison), table.rows, strict=True)
-    ):
+    keys = score_keys(comparison)
+    for place, (key, row) in enumerate(zip(keys, table.rows, strict=True)):
         # the place of a row is also the place of its block's heading
         if place in table.sections:
             told = found.setdefault(table.sections[place], [])
         # runs may be measured by different rules, as where one has no covariance
-        rules: dict[str, list[str]] = {}
-        for name in (run.estimator for run in comparison.runs):
-            if key in (scores := comparison.scores.get(name, {})):
-                rules.setdefault(scores[key].protocol, []).append(name)
-        told.append(
-            (
-                row[0].text,
-                key,
-                [
-                    ("" if len(rules) == 1 else ", ".join(names), rule)
-                    for rule, names in rules.items()
-                ],
-            )
+        rules = sentences.named_by(
+            (comparison.scores[run.estimator][key].protocol, run.estimator)
+            for run in comparison.runs
+            if key in comparison.scores.get(run.estimator, {})
         )
+        is_shared = len(rules) == 1
+        named = [("" if is_shared else names, rule) for rule, names in rules.items()]
+        told.append((row[0].text, key, named))
     return found
 
 
 def outcome_table(comparison: Comparison) -> Table:
     """Outcomes of detections, with count and share by run; a total in the last row."""
-    counts = [
-        Counter(run.detections.outcomes) if run.detections else None
-        for run in comparison.runs
-    ]
+    counts = [Counter(sentences.outcomes_of(run)) for run in comparison.runs]
     rows = []
     for outcome in Outcome:
         # outcomes that no run has would be most of the table
-        if any(count and count[outcome] for count in counts):
+        if any(count[outcome] for count in counts):
             shares = [_share(count, outcome) for count in counts]
             rows.append([outcome.value.capitalize(), *shares])
     if rows:
-        rows.append(
-            [
-                "All detections",
-                *(ABSENT if count is None else str(count.total()) for count in counts),
-            ]
-        )
+        totals = [str(count.total()) if count else ABSENT for count in counts]
+        rows.append(["All detections", *totals])
     columns = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
     cells = [[words(text) for text in row] for row in rows]
     return Table("outcomes", "What became of each detection", "", columns, cells)
 
 
-def _share(count: Counter[Outcome] | None, outcome: Outcome) -> str:
-    """Detections with an outcome, with their share of all."""
-    if count is None:
-        return ABSENT
+def _share(count: Counter[Outcome], outcome: Outcome) -> str:
+    """Detections with an outcome, with their share of all; a dash without detections."""
     number = count[outcome]
-    return f"{number} ({100 * number / count.total():.1f} %)" if number else "0"
+    if not number:
+        return "0" if count else ABSENT
+    return f"{number} ({100 * number / count.total():.1f} %)"
 
 
 def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
@@ -324,13 +303,10 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
     pictures = []
     for picture in found.shown():
         pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)
-        named = ", ".join(
-            f"ID {landmark} ({probability:.2f})" for landmark, probability in pairs
-        )
+        named = ", ".join(f"ID {landmark} ({share:.2f})" for landmark, share in pairs)
         caption = f"T = {(picture.stamp_ns - start_ns) * 1e-9:.1f} s: {named}"
-        pictures.append(
-            {"address": data_address(picture.jpeg, "image/jpeg"), "caption": caption}
-        )
+        address = data_address(picture.jpeg, "image/jpeg")
+        pictures.append({"address": address, "caption": caption})
     return {
         "frames": found.frames,
         "detections": 0 if sequence.detections is None else len(sequence.detections),
@@ -359,8 +335,7 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
 def _of_truth(sequence: Sequence) -> str:
     if sequence.truth is None:
         return "without ground truth"
-    return (
-        "with ground truth"
-        if sequence.true_poses
-        else "with true positions, but no true orientation"
+    orientation = (
+        "" if sequence.true_poses else "true positions, but no true orientation"
     )
+    return f"with {orientation or 'ground truth'}"

@@ -24,6 +24,7 @@ COLUMNS = {
     "time.update_median_ms": "med.",
     "time.update_max_ms": "max",
 }
+MARKS = {"over-confident": " ▲", "over-cautious": " ▼"}
 NEES_LEGEND = (
     "NEES: 1 fits; ▲ over-confident, ▼ over-cautious: outside what 95 % of consistent runs with as many independent "
     "samples have (the report has the bands)"
@@ -71,34 +72,24 @@ def summary(comparison: Comparison) -> Group:
         if key in present
     }
     table = Table(
-        title=Text(comparison.sequence.name, style="bold"), title_justify="left"
+        title=Text(comparison.sequence.name, style="bold"),
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
     )
-    table.box = SIMPLE_HEAD
-    table.show_edge = False
-    table.pad_edge = False
-    table.padding = (0, 1, 0, 0)
     table.add_column("estimator", no_wrap=True)
     for key, heading in columns.items():
-        unit = next(
-            scores[key].shown_unit
-            for scores in comparison.scores.values()
-            if key in scores
-        )
-        table.add_column(
-            Text(f"{heading}\n({unit})" if unit else heading),
-            justify="right",
-            no_wrap=True,
-        )
+        one = next(own[key] for own in comparison.scores.values() if key in own)
+        head = f"{heading}\n({one.shown_unit})" if one.shown_unit else heading
+        table.add_column(Text(head), justify="right", no_wrap=True)
     for name in (run.estimator for run in comparison.runs):
         cells = []
         for key in columns:
             score = comparison.score_of(name, key)
-            mark = (
-                {"over-confident": " ▲", "over-cautious": " ▼"}.get(score.verdict, "")
-                if score
-                else ""
-            )
-            cells.append(Text(score.text() + mark if score else ABSENT))
+            shown = score.text() + MARKS.get(score.verdict, "") if score else ABSENT
+            cells.append(Text(shown))
         table.add_row(Text(name), *cells)
     return Group(table, Text("\n".join(["", *_lines_below(comparison)])))
 
@@ -118,38 +109,35 @@ def _lines_below(comparison: Comparison) -> list[str]:
     if located := located_line(comparison):
         scored = comparison.environment["scored instants"]
         lines.append(f"{located} Scored: {scored}")
-    lines += sentences.refusal_lines(comparison)
-    lines += sentences.withheld_lines(comparison)
-    lines += [
-        *sentences.doubt_of_identities(comparison),
-        *sentences.outliers(comparison),
-        *sentences.shared_error(comparison),
-    ]
-    lines += sentences.nameless_landmarks(comparison)
+    for told in (
+        sentences.refusal_lines,
+        sentences.withheld_lines,
+        sentences.doubt_of_identities,
+        sentences.outliers,
+        sentences.shared_error,
+        sentences.nameless_landmarks,
+    ):
+        lines += told(comparison)
     if comparison.recognition is not None:
         found = comparison.recognition
+        named = found.naming(comparison.sequence.true_landmarks)
         warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
-        lines += [
-            f"Sonar images: {line}"
-            for line in [*found.naming(comparison.sequence.true_landmarks), *warned]
-        ]
+        lines += [f"Sonar images: {line}" for line in [*named, *warned]]
     elif "detections.model" in comparison.sequence.notes:
         lines.append(RECOGNISED_BEFORE)
     has_detections = bool(comparison.sequence.detections)
     if not has_detections:
         lines.append(sentences.no_detections(comparison))
     metric = headline_metric(comparison)
+    present = score_keys(comparison)
     if metric is None:
-        mapped = (
-            f"map: {label('se2_m', comparison)}"
-            if "landmarks.se2_m" in score_keys(comparison)
-            else ""
-        )
+        if "landmarks.se2_m" in present:
+            lines.append(f"map: {label('se2_m', comparison)}")
         why = comparison.environment["scored instants"].removeprefix("none: ")
-        return [*lines, *filter(None, [mapped]), f"No position errors: {why}"]
+        return [*lines, f"No position errors: {why}"]
     if metric != RAW:
         lines.append(f"aligned: {label(metric, comparison)}")
-    if f"causal.{RAW}" in score_keys(comparison):
+    if f"causal.{RAW}" in present:
         lines.append(f"raw: {label(RAW, comparison)}")
     lines.append(NEES_LEGEND)
     for name in (run.estimator for run in comparison.runs):

@@ -58,6 +58,8 @@ SHAPES = (0.45, 1.25)
 PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"} | {
     own: f"--run-{index}" for index, own in enumerate(ESTIMATOR_COLOURS)
 }
+# settings of matplotlib for the size of texts
+TEXTS = ("axes.labelsize", "axes.titlesize", "xtick.labelsize", "ytick.labelsize", "legend.fontsize")  # fmt: skip
 POINTS_PER_INCH = 72
 CSS_PIXELS_PER_INCH = 96
 LEAST_TICKS = 3
@@ -91,18 +93,10 @@ def colour(index: int) -> str:
     return ESTIMATOR_COLOURS[index % len(ESTIMATOR_COLOURS)]
 
 
-def line_style(index: int) -> Any:
-    """Line style of the comparison's run with this index, for figures in which runs share a panel."""
-    return LINE_STYLES[index % len(LINE_STYLES)]
-
-
 def run_look(index: int, width: float) -> dict[str, Any]:
-    """Colour, line style and line width (points) of the comparison's run with this index."""
-    return {
-        "color": colour(index),
-        "linestyle": line_style(index),
-        "linewidth": width,
-    }
+    """Colour, line style and line width (points) of the comparison's run with this index, where runs share a panel."""
+    line_style = LINE_STYLES[index % len(LINE_STYLES)]
+    return {"color": colour(index), "linestyle": line_style, "linewidth": width}
 
 
 @contextmanager
@@ -113,19 +107,11 @@ def sized(
 ) -> Iterator[None]:
     """Let all figures that are drawn in the block have this width and size of text."""
     # settings, not arguments: the same functions then draw for a page and for a paper
-    settings: Any = {
+    settings: Any = dict.fromkeys(TEXTS, "medium") | {
         "figure.figsize": (width_in, width_in),
         "font.size": text_pt,
         "font.family": font,
     }
-    for text in (
-        "axes.labelsize",
-        "axes.titlesize",
-        "xtick.labelsize",
-        "ytick.labelsize",
-        "legend.fontsize",
-    ):
-        settings[text] = "medium"
     with mpl.rc_context(settings):
         yield
 
@@ -168,12 +154,6 @@ def blank_panels(
             spine.set_visible(side in ("left", "bottom"))
             spine.set_color(RULE)
     return figure, axes
-
-
-def one_panel() -> tuple[Figure, Axes]:
-    """A figure of one styled, empty panel."""
-    figure, axes = blank_panels(1, 1, size_in(1))
-    return figure, axes[0, 0]
 
 
 def arrange(figure: Figure) -> None:
@@ -237,8 +217,7 @@ class SeveralTicks(LogLocator):
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
         """Places of the ticks for an axis between two values."""
-        low = min(vmin, vmax)
-        high = max(vmin, vmax)
+        low, high = sorted([vmin, vmax])
         for between in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0)):
             self.set_params(subs=between)
             ticks = np.asarray(super().tick_values(vmin, vmax))
@@ -254,8 +233,7 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
     """
     scale = 1.0 / panel.figure.dpi
     places_in = panel.transData.transform(points) * scale  # (n, 2)
-    edges = panel.get_window_extent()
-    frame = np.array([[edges.x0, edges.y0], [edges.x1, edges.y1]]) * scale
+    frame = panel.get_window_extent().get_points() * scale
     size_in = text_pt() / POINTS_PER_INCH
     height = NAME_HEIGHT * size_in
     # names must not cover the marks of other landmarks
@@ -263,10 +241,9 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
     for name, at, point in zip(names, places_in, points, strict=True):
         width = size_in * BOLD_LETTER * len(name)
         for x, y in NAME_PLACES:
+            left = -width / 2 if x == 0 else min(x, 0) * width
             low = at + np.array([x * MARK_IN, y * MARK_IN])
-            low += np.array([min(x, 0) * width, (y - 1) / 2 * height])
-            if x == 0:
-                low[0] -= width / 2
+            low += np.array([left, (y - 1) / 2 * height])
             high = low + np.array([width, height])
             # two boxes are apart where they are apart in one direction
             is_free = all(
@@ -276,11 +253,10 @@ def label_points(panel: Axes, names: list[str], points: Floats) -> None:
             if not is_free or np.any(low < frame[0]) or np.any(high > frame[1]):
                 continue
             taken.append((low, high))
-            offset_pt = (low - at) * POINTS_PER_INCH
             panel.annotate(
                 name,
-                (point[0], point[1]),
-                xytext=(offset_pt[0], offset_pt[1]),
+                tuple(point),
+                xytext=tuple((low - at) * POINTS_PER_INCH),
                 textcoords="offset points",
                 color=INK,
                 fontweight="bold",
@@ -311,20 +287,20 @@ def legend_above(figure: Figure, panel: Axes) -> None:
 def dots(panel: Axes, x: Floats, y: Floats, own_colour: str, label: str = "") -> None:
     """Dots as strokes without length: one element of the drawing, where each marker is one."""
     points = np.column_stack([x, y])
-    path = MarkPath(
-        np.repeat(points, 2, axis=0), [MarkPath.MOVETO, MarkPath.LINETO] * len(x)
-    )
+    strokes = [MarkPath.MOVETO, MarkPath.LINETO] * len(x)
+    path = MarkPath(np.repeat(points, 2, axis=0), strokes)
     # simplification would leave out strokes without length
     path.should_simplify = False
-    look: dict[str, Any] = {
-        "edgecolor": own_colour,
-        "facecolor": "none",
-        "linewidth": 2.0,
-        "alpha": 0.5,
-    }
-    panel.add_artist(
-        PathPatch(path, capstyle="round", transform=panel.transData, **look)
+    dots = PathPatch(
+        path,
+        capstyle="round",
+        transform=panel.transData,
+        edgecolor=own_colour,
+        facecolor="none",
+        linewidth=2.0,
+        alpha=0.5,
     )
+    panel.add_artist(dots)
     # a patch that is added does not widen the axes
     panel.update_datalim(points)
     panel.autoscale_view()
@@ -346,22 +322,18 @@ def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
     n = len(values)
     if n <= points:
         return np.arange(n)
-    # two rows a stretch: its lowest and its highest
-    edges = np.linspace(0, n, points // 2 + 1).astype(np.int64)
-    stretches = list(pairwise(edges.tolist()))
-    # argmin and argmax give the first NaN of a stretch that has one, which keeps the gap
-    lowest = [first + int(np.argmin(values[first:last])) for first, last in stretches]
-    highest = [first + int(np.argmax(values[first:last])) for first, last in stretches]
-    return np.unique(np.array([0, *lowest, *highest, n - 1], dtype=np.int64))
+    edges = np.linspace(0, n, points // 2 + 1).astype(np.int64).tolist()
+    rows = [0, n - 1]
+    for first, last in pairwise(edges):
+        stretch = values[first:last]
+        # argmin and argmax give the first NaN of a stretch that has one, which keeps the gap
+        rows += [first + int(np.argmin(stretch)), first + int(np.argmax(stretch))]
+    return np.unique(np.array(rows, dtype=np.int64))
 
 
 def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
     """At most ``points`` rows out of n, equally spaced, first and last among them."""
-    return (
-        np.unique(np.linspace(0, n - 1, min(n, points)).round().astype(np.int64))
-        if n
-        else np.empty(0, np.int64)
-    )
+    return np.unique(np.linspace(0, n - 1, min(n, points)).round().astype(np.int64))
 
 
 def evenly_with_extremes(values: Floats, points: int) -> Ints:
@@ -388,17 +360,15 @@ def inline_svg(figure: Figure, name: str, description: str, width: str = "") -> 
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     svg = buffer.getvalue()
     svg = svg[svg.index(">", svg.index("<svg")) + 1 :]
-    # metadata and comments are of no use; a style rule would reach the whole page
-    svg = re.sub(
-        r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->",
-        "",
-        svg,
-        flags=re.DOTALL,
-    )
-    svg = re.sub(r"\s*\n\s*", "\n", svg)
-    svg = re.sub(r'(\s)id="([^"]+)"', rf'\1id="{name}-\2"', svg)
-    svg = re.sub(r'(?:xlink:)?href="#([^"]+)"', rf'href="#{name}-\1"', svg)
-    svg = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", svg)
+    for found, instead in (
+        # metadata and comments are of no use; a style rule would reach the whole page
+        (r"(?s)<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", ""),
+        (r"\s*\n\s*", "\n"),
+        (r'(\s)id="([^"]+)"', rf'\1id="{name}-\2"'),
+        (r'(?:xlink:)?href="#([^"]+)"', rf'href="#{name}-\1"'),
+        (r"url\(#([^)]+)\)", rf"url(#{name}-\1)"),
+    ):
+        svg = re.sub(found, instead, svg)
     for own, variable in PAGE_COLOURS.items():
         svg = svg.replace(own, f"var({variable})")
     width_in, height_in = map(float, figure.get_size_inches())

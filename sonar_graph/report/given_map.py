@@ -1,6 +1,7 @@
 """A map of known landmarks beside what the dive made of it: what moved, what was not seen, where the start was found."""
 
 import math
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -16,28 +17,16 @@ DECIMALS = 3
 MOVED = "moved"
 
 
-def moved_landmarks(run: RunResult) -> set[int]:
-    """Landmarks of the given map that the run has taken out of it, and initialised again."""
+def landmarks_with(run: RunResult, outcomes: Container[Outcome]) -> set[int]:
+    """Landmarks with a detection of one of these outcomes.
+
+    One of the given map that is `Outcome.NEW` was taken out of it, and initialised again.
+    """
     if run.detections is None:
         return set()
     ids = run.detections.landmark_ids.tolist()
-    outcomes = run.detections.outcomes
-    return {i for i, each in zip(ids, outcomes, strict=True) if each is Outcome.NEW}
-
-
-def seen_landmarks(run: RunResult) -> set[int]:
-    """Landmarks with a detection."""
-    return set() if run.detections is None else set(run.detections.landmark_ids)
-
-
-def used_landmarks(run: RunResult) -> set[int]:
-    """Landmarks with a detection that changed the estimate."""
-    if run.detections is None:
-        return set()
-    ids = run.detections.landmark_ids.tolist()
-    outcomes = run.detections.outcomes
-    used = (Outcome.USED, Outcome.NEW)
-    return {i for i, each in zip(ids, outcomes, strict=True) if each in used}
+    pairs = zip(ids, run.detections.outcomes, strict=True)
+    return {landmark_id for landmark_id, each in pairs if each in outcomes}
 
 
 def located_line(comparison: Comparison) -> str:
@@ -47,7 +36,7 @@ def located_line(comparison: Comparison) -> str:
         return ""
     parts = []
     for run in comparison.runs:
-        if run.causal is None or not len(run.causal):
+        if not run.causal:
             parts.append(f"{run.estimator}: not located")
             continue
         seconds = (run.causal.stamps_ns[0] - sequence.start_ns) * 1e-9
@@ -70,15 +59,15 @@ def draw_given_map(panel: Axes, comparison: Comparison) -> None:
     row = {landmark_id: k for k, landmark_id in enumerate(known.ids)}
     for index, run in enumerate(comparison.runs):
         own = style.colour(index)
-        for landmark_id in sorted(moved_landmarks(run) & row.keys()):
+        for landmark_id in sorted(landmarks_with(run, {Outcome.NEW}) & row.keys()):
             found = place_of(run, landmark_id)
             if found is not None:
                 ends = np.array([places[row[landmark_id]], found[:2]])
                 panel.plot(*ends.T, color=own, linewidth=2.5, zorder=6)
         is_found = comparison.sequence.calibration.start.source == "map"
-        if is_found and run.causal is not None and len(run.causal):
-            first = run.causal.positions[0]
-            panel.plot(first[0], first[1], "*", color=own, markersize=13, zorder=7)
+        if is_found and run.causal:
+            first = run.causal.positions[0, :2]
+            panel.plot(*first, "*", color=own, markersize=13, zorder=7)
 
 
 def place_of(run: RunResult, landmark_id: int) -> Any:
@@ -101,16 +90,16 @@ def given_map_table(comparison: Comparison) -> Table | None:
         cells = []
         for run in runs:
             found = place_of(run, landmark_id)
-            if landmark_id not in seen_landmarks(run):
+            if landmark_id not in landmarks_with(run, list(Outcome)):
                 cells.append("not seen")
             elif found is None:
                 cells.append(ABSENT)
-            elif landmark_id not in used_landmarks(run):
+            elif landmark_id not in landmarks_with(run, {Outcome.USED, Outcome.NEW}):
                 # where it stands is not known by this dive
                 cells.append("refused")
             else:
                 away_m = fixed(math.hypot(*(found - given)[:2]), DECIMALS)
-                is_moved = landmark_id in moved_landmarks(run)
+                is_moved = landmark_id in landmarks_with(run, {Outcome.NEW})
                 cells.append(f"{away_m}, {MOVED}" if is_moved else away_m)
         place = f"{fixed(given[0], DECIMALS)}, {fixed(given[1], DECIMALS)}"
         rows.append([str(landmark_id), place, fixed(sigmas_m[k], DECIMALS), *cells])

@@ -43,7 +43,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
     # a map may also be aligned because its world is not that of the truth
     is_aligned = comparison.is_aligned
     for run in comparison.runs:
-        if run.landmarks is not None and len(run.landmarks):
+        if run.landmarks:
             scored = scored_map(run.landmarks, comparison.sequence)
             maps[run.estimator] = run.landmarks if scored is None else scored.landmarks
             is_aligned |= scored is not None and scored.alignment is not None
@@ -56,34 +56,27 @@ def landmark_table(comparison: Comparison) -> Table | None:
         # the paper gives x and y
         for axis in (0, 1):
             at = coordinate(true, id_, axis)
-            cells = [
-                _with_difference(
-                    coordinate(landmarks, id_, axis),
-                    at,
-                    PAPER_DECIMALS if name == PAPER else DECIMALS,
-                )
-                for name, landmarks in maps.items()
-            ]
-            rows.append(
-                [
-                    f"ID {landmark_name(id_)}, {'xy'[axis]}",
-                    _with_difference(at, None, DECIMALS),
-                    *cells,
-                ]
-            )
+            row = [f"ID {landmark_name(id_)}, {'xy'[axis]}"]
+            row.append(_with_difference(at, None, DECIMALS))
+            for name, landmarks in maps.items():
+                decimals = PAPER_DECIMALS if name == PAPER else DECIMALS
+                value = coordinate(landmarks, id_, axis)
+                row.append(_with_difference(value, at, decimals))
+            rows.append(row)
     sections = {}
     if true is not None:
         # below the last landmark
         sections[len(rows)] = "In all"
         errors = [landmark_errors(landmarks, true) for landmarks in maps.values()]
-        raw = [fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors]
+        if not is_aligned:
+            raw = [
+                fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors
+            ]
+            rows.append([f"RMS, {unaligned(comparison.sequence)}", "", *raw])
         aligned = [
             ABSENT if np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS)
             for e in errors
         ]
-        rows += (
-            [] if is_aligned else [[f"RMS, {unaligned(comparison.sequence)}", "", *raw]]
-        )
         rows.append(["RMS after SE(2) alignment", "", *aligned])
     heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
     heads += [Column(name, name) for name in maps]
@@ -91,9 +84,9 @@ def landmark_table(comparison: Comparison) -> Table | None:
     if true is None:
         heads = [heads[0], *heads[2:]]
         rows = [[row[0], *row[2:]] for row in rows]
-    caption = "Positions in the map at the end, metres" + (
-        "" if true is None else "; in brackets estimate minus truth"
-    )
+    caption = "Positions in the map at the end, metres"
+    if true is not None:
+        caption += "; in brackets estimate minus truth"
     if comparison.is_aligned:
         caption += "; each map aligned to the true landmarks"
     elif is_aligned:
@@ -102,24 +95,15 @@ def landmark_table(comparison: Comparison) -> Table | None:
         )
     elif true is not None:
         caption += f"; {unaligned(comparison.sequence)}"
-    return Table(
-        "landmarks",
-        caption,
-        "",
-        heads,
-        [[words(text) for text in row] for row in rows],
-        sections,
-    )
+    cells = [[words(text) for text in row] for row in rows]
+    return Table("landmarks", caption, "", heads, cells, sections)
 
 
 def mapped_ids(comparison: Comparison, maps: list[LandmarkMap]) -> list[int]:
     """Identities of the true landmarks; where these are not known, of the maps."""
     true = comparison.sequence.true_landmarks
-    return np.unique(
-        np.concatenate(
-            [landmarks.ids for landmarks in ([true] if true is not None else maps)]
-        )
-    ).tolist()
+    known = maps if true is None else [true]
+    return sorted({id_ for landmarks in known for id_ in landmarks.ids.tolist()})
 
 
 def landmarks_left_out(comparison: Comparison) -> int:

@@ -130,37 +130,27 @@ def _of_comparison(
         *rules,
         f"Settings of every run and all scores: comparison.json. Command: {environment['command']}",
     ]
-    return (
-        figures,
-        [compact_table(comparison), *comparison_tables(comparison)],
-        "\n\n".join(lines),
-    )
+    tables = [compact_table(comparison), *comparison_tables(comparison)]
+    return figures, tables, "\n\n".join(lines)
 
 
 def _of_batch(batch: RecordedBatch) -> tuple[list[PaperFigure], list[Table], str]:
     with sized(PAGE_IN, TEXT_PT, FONT):
         content = batch_content(batch)
-    drawn = [chapter["drawing"] for chapter in content["chapters"]]
     figures = [
         PaperFigure(one.name, f"{one.title}. {one.caption}", one.figure)
-        for one in drawn
-        if one is not None
+        for one in filter(None, (chapter["drawing"] for chapter in content["chapters"]))
     ]
     versions = {name: " or ".join(found) for name, found in content["origins"].items()}
+    metrics = [chapter["metric"] for chapter in content["chapters"]]
     lines = [
         f"{content['summary']} Suite {batch.name}, sonar_graph {versions.get('sonar_graph', 'of unknown version')}.",
-        *(
-            f"{chapter['metric'].label}: {chapter['metric'].protocol}"
-            for chapter in content["chapters"]
-        ),
+        *(f"{metric.label}: {metric.protocol}" for metric in metrics),
         f"{' '.join(content['estimates'])} Tests of a metric are corrected by Holm (1979). "
         f"Every run: {content['results']}.",
     ]
-    return (
-        figures,
-        [table for table in content["tables"] if table.rows],
-        "\n\n".join(lines),
-    )
+    tables = [table for table in content["tables"] if table.rows]
+    return figures, tables, "\n\n".join(lines)
 
 
 def _write_figure(one: PaperFigure, folder: Path) -> None:

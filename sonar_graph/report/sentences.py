@@ -7,6 +7,7 @@ too small it has 1e-9 to the power of 1/f².
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from sonar_graph.evaluation import (
     MOST_ROWS_NAMED,
     RAW,
     Comparison,
-    RefusedRows,
     RunResult,
     Score,
     gathered,
@@ -26,14 +26,18 @@ from sonar_graph.evaluation import (
     label,
     landmark_errors,
     likeness,
+    nis,
     normalised_squares,
+    rmse,
     scored_map,
+    used_squares,
 )
 from sonar_graph.models import MOVED
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.settings import flattened
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome, counted, landmark_name
 
+Said = TypeVar("Said")
 # the filter with the robust kernel and the gyro bias that filters as published lack
 FAIR = "invariant-ekf"
 # relative difference of two errors below which one run cannot decide which is the smaller one
@@ -67,6 +71,8 @@ POLICY = "identity.policy"
 UNKNOWN = "identity.unknown.policy"
 WARNING = "Warning"
 DOUBTFUL = "Doubtful"
+# beginnings of lines that put results in doubt
+IN_DOUBT = (f"{WARNING}:", f"{DOUBTFUL}:")
 BEYOND = "beyond doubt"
 CONTRADICTED = "sightings contradict the map"
 # sigma of a start in a map, from which on wrong first sightings lead far away
@@ -100,17 +106,20 @@ def remarks(comparison: Comparison) -> list[str]:
     return sentences
 
 
-def grave_lines(comparison: Comparison) -> list[str]:
-    """Sentences on runs that failed or lost their way."""
-    return [*failed_lines(comparison), *lost_runs(comparison)]
-
-
 def failed_lines(comparison: Comparison) -> list[str]:
     """A sentence for each reason for which runs failed."""
-    names: dict[str, list[str]] = {}
-    for run in comparison.failed_runs:
-        names.setdefault(run.reason.rstrip("."), []).append(run.estimator)
-    return [f"{', '.join(own)} failed: {reason}." for reason, own in names.items()]
+    names = named_by(
+        (run.reason.rstrip("."), run.estimator) for run in comparison.failed_runs
+    )
+    return [f"{own} failed: {reason}." for reason, own in names.items()]
+
+
+def named_by(pairs: Iterable[tuple[Said, str]]) -> dict[Said, str]:
+    """Each thing that runs have, with the names of the runs: most have the same, and one line is enough for all."""
+    names: dict[Said, list[str]] = {}
+    for said, name in pairs:
+        names.setdefault(said, []).append(name)
+    return {said: ", ".join(own) for said, own in names.items()}
 
 
 def doubts(comparison: Comparison) -> list[str]:
@@ -118,13 +127,18 @@ def doubts(comparison: Comparison) -> list[str]:
     notes = comparison.sequence.notes
     doubtful = doubtful_lines(comparison)
     return [
-        *grave_lines(comparison),
+        *failed_lines(comparison),
+        *lost_runs(comparison),
         *doubtful[1:],
         *doubt_of_identities(comparison),
         *outliers(comparison),
         *shared_error(comparison),
         *alike_errors(comparison),
-        *(line for line in warning_lines(notes) if line not in doubtful),
+        *(
+            line
+            for line in doubt_lines(notes)
+            if line.startswith(IN_DOUBT) and line not in doubtful
+        ),
         *withheld_lines(comparison),
     ]
 
@@ -164,43 +178,41 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
     leads = f"is nearest to the truth{equals}:" if others else "is"
     opening = f"{name} {leads} {least.with_unit} off{'' if others else ' the truth'} ({what}, causal)"
     # a wrong map can come with a small error by luck
-    is_in_doubt = any(
-        name in line
-        for line in [*doubt_of_identities(comparison), *lost_runs(comparison)]
-    )
-    if is_in_doubt:
+    lines = [*doubt_of_identities(comparison), *lost_runs(comparison)]
+    if any(name in line for line in lines):
         return f"{opening}, but its warning must be settled first."
     return f"{opening}. {_worth_of_covariances(comparison, name)}".strip()
 
 
 def _in_order(comparison: Comparison, key: str) -> list[tuple[str, Score]]:
     """Runs with an error, smallest first."""
-    errors = {
-        run.estimator: comparison.score_of(run.estimator, key)
+    known = [
+        (run.estimator, score)
         for run in comparison.runs
-    }
-    known = [(name, score) for name, score in errors.items() if score]
+        if (score := comparison.score_of(run.estimator, key))
+    ]
     return sorted(known, key=lambda item: item[1].value)
 
 
 def _worth_of_covariances(comparison: Comparison, name: str) -> str:
     """One sentence on whether the covariances of a run fit its errors; empty where it has no NEES."""
-    judged = {
-        what: comparison.score_of(name, key) for what, key in CONSISTENCY_KEYS.items()
+    known = {
+        what: score
+        for what, key in CONSISTENCY_KEYS.items()
+        if (score := comparison.score_of(name, key))
     }
-    known = {what: score for what, score in judged.items() if score}
     if not known:
         return ""
     verdicts = {score.verdict for score in known.values()}
-    if verdicts & {"over-confident", "over-cautious"}:
-        listed = " and ".join(
-            f"of {what} {score.text()}"
-            for what, score in known.items()
-            if score.verdict.startswith("over")
-        )
+    misfits = [
+        f"of {what} {score.text()}"
+        for what, score in known.items()
+        if score.verdict.startswith("over")
+    ]
+    if misfits:
         is_small = "over-confident" in verdicts
         fault = "too small: do not rely on them" if is_small else "too large"
-        return f"Its covariances are {fault} (NEES {listed}, 1 fits)."
+        return f"Its covariances are {fault} (NEES {' and '.join(misfits)}, 1 fits)."
     if any(verdicts):
         return "Its covariances fit its errors."
     return "One run is too short to judge its covariances."
@@ -212,8 +224,9 @@ def published_filters(comparison: Comparison) -> str:
     names = [run.estimator for run in comparison.runs if run.is_as_published]
     if not names:
         return ""
-    is_there = any(run.estimator == FAIR for run in comparison.runs)
-    where = "" if is_there else f"; add it with --estimators {','.join([*names, FAIR])}"
+    where = f"; add it with --estimators {','.join([*names, FAIR])}"
+    if any(run.estimator == FAIR for run in comparison.runs):
+        where = ""
     return (
         f"{' and '.join(names)}: as published, without gate, robust kernel or gyro bias. "
         f"The fair neighbour is {FAIR}, which has kernel and bias{where}."
@@ -252,19 +265,17 @@ def lost_runs(comparison: Comparison) -> list[str]:
     """A sentence on each run whose gate refused more than `GATED_SHARE` of the detections."""
     said = []
     for run in comparison.runs:
-        outcomes = run.detections.outcomes if run.detections else []
+        outcomes = outcomes_of(run)
         gated = outcomes.count(Outcome.GATED)
         # a map that the log contradicts has a message of its own, and no other gate mends it
-        is_of_map = any(
-            "the map, and too few others agree" in text for text in run.withheld
-        )
+        is_of_map = "the map, and too few others agree" in "\n".join(run.withheld)
         # a gate that refuses so much refuses the truth
-        if gated > GATED_SHARE * max(len(outcomes), 1) and not is_of_map:
-            is_smoother = flattened(run.params).get(POLICY) == "gate"
-            advice = ' (try identity.policy = "max-mixture")' if is_smoother else ""
-            without = (
-                'identity.policy = "robust"' if is_smoother else "gate_probability = 1"
-            )
+        if gated > GATED_SHARE * len(outcomes) and not is_of_map:
+            advice = ""
+            without = "gate_probability = 1"
+            if flattened(run.params).get(POLICY) == "gate":
+                advice = ' (try identity.policy = "max-mixture")'
+                without = 'identity.policy = "robust"'
             said.append(
                 f"{run.estimator} refused {gated} of {len(outcomes)} detections as outside its gate: it has lost its "
                 f"way, identities are wrong{advice}, or noise is set far too small, and the gate may keep it there "
@@ -314,21 +325,15 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
     """
     lines = []
     blind = {}
+    hint = f'; isam2 maps them by place with {UNKNOWN} = "associate"'
     for run in comparison.runs:
-        outcomes = (
-            [outcome for outcome in run.detections.outcomes if outcome not in UNHEARD]
-            if run.detections
-            else []
-        )
+        outcomes = [one for one in outcomes_of(run) if one not in UNHEARD]
         # no identity can be used, so nothing is mapped
         if outcomes and set(outcomes) <= NAMELESS:
             blind[run.estimator] = len(outcomes)
+            if flattened(run.params).get(UNKNOWN) == "associate":
+                hint = ""
     if blind:
-        runs = [run for run in comparison.runs if run.estimator in blind]
-        asked = any(flattened(run.params).get(UNKNOWN) == "associate" for run in runs)
-        hint = (
-            "" if asked else f'; isam2 maps them by place with {UNKNOWN} = "associate"'
-        )
         lines.append(
             f"{WARNING}: none of {max(blind.values())} detections has an identity that {', '.join(blind)} can use: "
             f"no landmark is mapped{hint}"
@@ -342,23 +347,15 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
                 continue
             # with a truth the errors show which landmark is wrong
             errors = landmark_errors(scored.landmarks, true)
-            squares = normalised_squares(
-                errors.horizontal_m, errors.horizontal_covs
-            ).tolist()
-            wrong = {
-                id_: square / 2
-                for id_, square in zip(errors.ids.tolist(), squares, strict=True)
-                if square > ABSURD
-            }
+            squares = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
+            for id_, square in zip(errors.ids.tolist(), squares.tolist(), strict=True):
+                if square > ABSURD:
+                    wrong[id_] = square / 2
             said = f" puts {_landmarks(wrong)} far outside its covariance (NEES up to"
         elif run.landmarks is not None and (log := run.detections) is not None:
-            innovations = normalised_squares(log.innovations, log.innovation_covs)
-            used = np.array(
-                [outcome is Outcome.USED for outcome in log.outcomes], dtype=bool
-            )
-            used &= np.isfinite(innovations)
+            squares = used_squares(log)
             for id_ in run.landmarks.ids.tolist():
-                own = innovations[used & (log.landmark_ids == id_)]
+                own = squares[np.isfinite(squares) & (log.landmark_ids == id_)]
                 if own.size and np.mean(own > ABSURD) > CONTRADICTING_SHARE:
                     wrong[id_] = float(own.mean() / 2)
             said = (
@@ -372,6 +369,11 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
                 f"{WARNING}: {run.estimator}{said} {max(wrong.values()):.0f}); {advice}"
             )
     return lines
+
+
+def outcomes_of(run: RunResult) -> list[Outcome]:
+    """Outcomes of a run's detections; none where it has no log of them."""
+    return run.detections.outcomes if run.detections else []
 
 
 def outliers(comparison: Comparison) -> list[str]:
@@ -397,19 +399,14 @@ def shared_error(comparison: Comparison) -> list[str]:
     for run in comparison.runs:
         error = comparison.scores[run.estimator].get("causal.ate_se2_m")
         errors = comparison.errors.get(run.estimator, {}).get("causal")
-        outcomes = run.detections.outcomes if run.detections else []
-        if error is not None and errors is not None and Outcome.USED in outcomes:
+        if error and errors and Outcome.USED in outcomes_of(run):
             used[run.estimator] = (error.value, errors)
     if len(used) < 2:
         return []
     error_m = min(value for value, _ in used.values())
-    (_, first), *others = used.values()
-    apart_m = 0.0
-    for _, other in others:
-        if not np.array_equal(first.stamps_ns, other.stamps_ns):
-            return []
-        between = (other.position_m - first.position_m)[:, :2]
-        apart_m = max(apart_m, float(np.sqrt(np.mean(np.sum(between**2, axis=1)))))
+    # all runs of a comparison are scored at the same instants
+    paths_m = [errors.position_m[:, :2] for _, errors in used.values()]
+    apart_m = max(rmse(path_m - paths_m[0]) for path_m in paths_m)
     sigmas_m = [
         np.nanmedian(np.linalg.norm(errors.position_sigma_m[:, :2], axis=1))
         for _, errors in used.values()
@@ -425,12 +422,9 @@ def shared_error(comparison: Comparison) -> list[str]:
 
 def absurd_detections(run: RunResult) -> tuple[int, int]:
     """Detections that were used although their squared innovation exceeds `ABSURD`, and all that were used."""
-    log = run.detections
-    if log is None:
+    if run.detections is None:
         return 0, 0
-    squares = normalised_squares(log.innovations, log.innovation_covs)
-    is_used = np.array([outcome is Outcome.USED for outcome in log.outcomes], np.bool_)
-    squares = squares[np.isfinite(squares) & is_used]
+    squares = nis(run.detections)
     return int(np.count_nonzero(squares > ABSURD)), len(squares)
 
 
@@ -452,26 +446,20 @@ def alike_errors(comparison: Comparison) -> list[str]:
             each = likeness(run.detections)
             if each.pairs >= FEWEST_PAIRS:
                 found.append((run.estimator, each))
-    noise = (
-        sequence.detections.range_azimuth_cov if sequence.detections else np.empty(0)
-    )
-    is_logged = bool(np.isfinite(noise).any())
-    sonar = sequence.calibration.sonar
-    sigmas = (sonar.range_sigma_m, sonar.azimuth_sigma_rad)
+    if not found:
+        return []
+    given = sequence.detections
     lines = []
     for column, key in enumerate(("range_sigma_m", "azimuth_sigma_rad")):
-        if not found:
-            break
         name, least = min(found, key=lambda one: one[1].correlation[column])
         rho = least.correlation[column]
         factor = least.sigma_factors()[column]
         if rho <= ALIKE or factor <= LEAST_FACTOR:
             continue
-        remedy = (
-            f"give sigmas {factor:.1f} times as large with the detections"
-            if is_logged
-            else f"write `{key} = {factor * sigmas[column]:.2g}` under [sonar]"
-        )
+        sigma = factor * getattr(sequence.calibration.sonar, key)
+        remedy = f"write `{key} = {sigma:.2g}` under [sonar]"
+        if given and np.isfinite(given.range_azimuth_cov).any():
+            remedy = f"give sigmas {factor:.1f} times as large with the detections"
         lines.append(
             f"{WARNING}: {name}: errors of {key.split('_')[0]} are alike in successive sightings of a landmark "
             f"(correlation {rho:.2f} in {least.pairs} pairs, 0 where independent): covariances are too small, also where "
@@ -482,15 +470,12 @@ def alike_errors(comparison: Comparison) -> list[str]:
 
 def _weight(settings: Mapping[str, object]) -> str:
     """How much an outlier counts by the kernel of these settings, with a comma before; empty where they have none."""
-    kernels = [name for name in ("kernel.shape", "kernel_width") if name in settings]
-    if not kernels:
-        return ""
-    has_kernel = settings[kernels[0]] not in ("none", 0)
-    return (
-        ", with less weight by its kernel"
-        if has_kernel
-        else f", with full weight ({kernels[0]} sets a kernel)"
-    )
+    for name in ("kernel.shape", "kernel_width"):
+        if name in settings:
+            if settings[name] in ("none", 0):
+                return f", with full weight ({name} sets a kernel)"
+            return ", with less weight by its kernel"
+    return ""
 
 
 def nameless_landmarks(comparison: Comparison) -> list[str]:
@@ -498,27 +483,16 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
     said = []
     true = comparison.sequence.true_landmarks
     for run in comparison.runs:
-        count = (
-            0
-            if run.landmarks is None
-            else int((run.landmarks.ids >= FIRST_ANONYMOUS_ID).sum())
-        )
+        ids = run.landmarks.ids if run.landmarks else np.empty(0)
+        count = int((ids >= FIRST_ANONYMOUS_ID).sum())
         if run.landmarks is None or not count:
             continue
+        which = "none is at the place of a true one"
+        scored = scored_map(run.landmarks, comparison.sequence)
         if true is None:
             which = f"u0 stands for identity {FIRST_ANONYMOUS_ID} in the files"
-        else:
-            scored = scored_map(run.landmarks, comparison.sequence)
-            found = (
-                []
-                if scored is None
-                else np.setdiff1d(scored.landmarks.ids, run.landmarks.ids).tolist()
-            )
-            which = (
-                f"scored by place, as {_listed(found)}"
-                if found
-                else "none is at the place of a true one"
-            )
+        elif scored and (found := np.setdiff1d(scored.landmarks.ids, ids).tolist()):
+            which = f"scored by place, as {_listed(found)}"
         said.append(
             f"{run.estimator} found {counted(count, 'landmark')} without a name ({UNKNOWN}); {which}."
         )
@@ -528,7 +502,7 @@ def nameless_landmarks(comparison: Comparison) -> list[str]:
 def _landmarks(ids: Iterable[int]) -> str:
     """The word and the identities; empty without identities."""
     ids = list(ids)
-    return f"landmark{'s' if len(ids) > 1 else ''} {_listed(ids)}" if ids else ""
+    return f"landmark{'s' * (len(ids) > 1)} {_listed(ids)}" if ids else ""
 
 
 def _listed(ids: list[int]) -> str:
@@ -546,15 +520,6 @@ def doubt_lines(notes: Mapping[str, str]) -> list[str]:
         f"{word}: {notes[subject]}"
         for subject, word in SAID_NOTES.items()
         if subject in notes
-    ]
-
-
-def warning_lines(notes: Mapping[str, str]) -> list[str]:
-    """The lines of `doubt_lines` that put results in doubt."""
-    return [
-        line
-        for line in doubt_lines(notes)
-        if line.startswith((f"{WARNING}:", f"{DOUBTFUL}:"))
     ]
 
 
@@ -576,20 +541,14 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
         # a sensor that is wrong makes right ones contradict the estimate
         of_depth = of_sightings = "mend what is named above first"
     for run in comparison.runs:
-        refused = sum(
-            row.count for row in gathered(run.refused) if row.sensor == "depth"
-        )
+        refused = sum(row.sensor == "depth" for row in run.refused)
         if sequence.depth is not None and refused > len(sequence.depth) / 2:
             lines.append(
                 f"{DOUBTFUL}: {run.estimator} refused {refused} of {len(sequence.depth)} depths: {of_depth}"
             )
         if (log := run.detections) is not None:
-            used = np.array(
-                [outcome is Outcome.USED for outcome in log.outcomes], dtype=bool
-            )
-            ratios = normalised_squares(log.innovations, log.innovation_covs)[used] / 2
-            ratios = ratios[np.isfinite(ratios)]
-            if len(ratios) and float(np.median(ratios)) > BEYOND_DOUBT:
+            ratios = nis(log) / 2
+            if len(ratios) and np.median(ratios) > BEYOND_DOUBT:
                 lines.append(
                     f"{DOUBTFUL}: {run.estimator}: sightings of landmarks contradict the motion beyond doubt, "
                     f"typically {np.median(ratios):.0f} times what their noise allows: {of_sightings}"
@@ -602,39 +561,32 @@ def doubtful_lines(comparison: Comparison) -> list[str]:
     return lines
 
 
-def refused_by(comparison: Comparison) -> dict[RefusedRows, list[str]]:
-    """Refused rows of IMU and Doppler log, with the names of the runs that refused them."""
-    # runs mostly refuse the same rows: one line for all
-    names: dict[RefusedRows, list[str]] = {}
-    for run in comparison.runs:
-        for refused in gathered(run.refused):
-            names.setdefault(refused, []).append(run.estimator)
-    return names
-
-
 def refusal_lines(comparison: Comparison) -> list[str]:
     """A line for each refused row, or for many at once: sensor, time, reason, distance, and the runs."""
-    start_ns = comparison.sequence.start_ns
+    names = named_by(
+        (refused, run.estimator)
+        for run in comparison.runs
+        for refused in gathered(run.refused)
+    )
     lines = []
-    for refused, names in refused_by(comparison).items():
+    for refused, own in names.items():
         count = "" if refused.count == 1 else f"{refused.count} rows, "
-        distance = (
-            f" (squared distance {refused.distances()})" if refused.distances() else ""
-        )
-        at = f"{count}{refused.times(start_ns)} s"
+        distances = refused.distances()
+        distance = f" (squared distance {distances})" if distances else ""
+        at = f"{count}{refused.times(comparison.sequence.start_ns)} s"
         lines.append(
-            f"{WARNING}: {refused.sensor}, {at}: {refused.reason}{distance}; {', '.join(names)}"
+            f"{WARNING}: {refused.sensor}, {at}: {refused.reason}{distance}; {own}"
         )
     return lines
 
 
 def said_by(comparison: Comparison, most: int | None = None) -> dict[str, str]:
     """The first messages of each run about what it could not use, with the names of the runs that say the same."""
-    names: dict[str, list[str]] = {}
-    for run in comparison.runs:
-        for message in run.withheld[:most]:
-            names.setdefault(message, []).append(run.estimator)
-    return {message: ", ".join(own) for message, own in names.items()}
+    return named_by(
+        (message, run.estimator)
+        for run in comparison.runs
+        for message in run.withheld[:most]
+    )
 
 
 def withheld_lines(comparison: Comparison) -> list[str]:

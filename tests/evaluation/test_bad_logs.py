@@ -21,24 +21,21 @@ def frames_of(lane: Lane) -> list[SonarFrames]:
     return [lane.one(k) for k in range(COUNT)]
 
 
-def write(
+def recognised(
     lane: Lane, log: Path, frames: list[SonarFrames] | None = None, **changes: object
-) -> Path:
-    """A log with frames; changes are of message 30."""
-    messages = [
-        sonar_image_messages(TOPIC, frame) for frame in frames or frames_of(lane)
-    ]
+) -> Recognition:
+    """What is recognised in a log with frames; changes are of message 30."""
+    blocks = frames or frames_of(lane)
+    messages = [sonar_image_messages(TOPIC, frame) for frame in blocks]
     if changes:
         messages[30] = replace(messages[30], **changes)
     write_log(log, lane.sequence, messages)
-    return log
-
-
-def recognised(
-    lane: Lane, folder: Path, frames: list[SonarFrames] | None = None, **changes: object
-) -> Recognition:
-    log = write(lane, folder / "log.mcap", frames, **changes)
     return recognise_images(log, read_log(log))
+
+
+@pytest.fixture
+def log(tmp_path) -> Path:
+    return tmp_path / "log.mcap"
 
 
 def cropped(frame: SonarFrames, bins: int) -> SonarFrames:
@@ -57,12 +54,12 @@ def sure(found: Recognition) -> set[int]:
 
 @pytest.fixture(scope="module")
 def plain(lane, tmp_path_factory) -> Recognition:
-    return recognised(lane, tmp_path_factory.mktemp("plain"))
+    return recognised(lane, tmp_path_factory.mktemp("plain") / "log.mcap")
 
 
-def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
+def test_two_windows_in_turn_are_both_used(lane, log, plain):
     frames = [cropped(f, 450) if k % 2 else f for k, f in enumerate(frames_of(lane))]
-    found = recognised(lane, tmp_path, frames)
+    found = recognised(lane, log, frames)
     assert sum("not used" in reason for _, reason in found.warnings) == 1
     assert sure(found) == sure(plain)
     stamps = [int(frame.stamps_ns[0]) for frame in frames]
@@ -71,29 +68,31 @@ def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
     } == {0, 1}
 
 
-def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):
+def test_a_leap_of_the_clock_costs_one_frame(lane, log, plain):
     frames = frames_of(lane)
     recorded_ns = frames[30].stamps_ns
     frames[30] = replace(frames[30], stamps_ns=recorded_ns + 10 * SECONDS)
-    found = recognised(lane, tmp_path, frames, log_times_ns=recorded_ns)
+    found = recognised(lane, log, frames, log_times_ns=recorded_ns)
     assert found.warnings == [
         (int(frames[30].stamps_ns[0]), f"frame not used: {LEAPT}")
     ]
     assert len(found.detections) >= len(plain.detections) - 3
 
 
-def test_bad_frames_are_never_drawn(lane, tmp_path):
+def test_bad_frames_are_never_drawn(lane, log):
     frames = [
         replace(f, intensity=np.full(f.intensity.shape, np.nan, np.float32))
         for f in frames_of(lane)[:12]
     ]
-    found = recognised(lane, tmp_path, frames)
+    found = recognised(lane, log, frames)
     assert found.pictures == []
     assert found.outcomes == {"frame not used: samples that are not finite": 12}
 
 
-def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp_path):
-    log = write(lane, tmp_path / "log.mcap")
+def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, log):
+    write_log(
+        log, lane.sequence, [sonar_image_messages(TOPIC, f) for f in frames_of(lane)]
+    )
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
@@ -105,13 +104,13 @@ def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp
     assert COUNT / 2 < found.frames < COUNT
 
 
-def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tmp_path):
+def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, log):
     bare = replace(
         lane.sequence,
         depth=None,
         calibration=lane.sequence.calibration.model_copy(update={"floor": None}),
     )
-    found = recognised(replace(lane, sequence=bare), tmp_path)
+    found = recognised(replace(lane, sequence=bare), log)
     assert found.frames == COUNT
     assert found.warnings == []
     assert found.outcomes[NO_FLOOR] == COUNT

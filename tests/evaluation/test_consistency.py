@@ -178,21 +178,11 @@ def test_nis_takes_used_detections_only():
         outcomes,
     )
     np.testing.assert_allclose(consistency.nis(log), [1.0 + 9.0])
-    empty = DetectionLog(
-        np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), []
-    )
-    assert consistency.nis(empty).shape == (0,)
+    assert consistency.nis(DetectionLog.empty()).shape == (0,)
 
 
-def test_planar_nees_ignores_height():
-    pose = gtsam.Pose3()
+@pytest.mark.parametrize(("dof", "nees"), [(2, 1.0), (3, 2501.0)])
+def test_planar_nees_ignores_height(dof, nees):
     above = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 5.0]))
-    covariance = np.diag([1e-2] * 3 + [1e-2] * 3)
-    planar = consistency.error_series(
-        single(above, covariance), single(pose, covariance), 2
-    )
-    spatial = consistency.error_series(
-        single(above, covariance), single(pose, covariance), 3
-    )
-    assert planar.nees_position[0] == pytest.approx(1.0)
-    assert spatial.nees_position[0] == pytest.approx(1.0 + 2500.0)
+    paths = (single(pose, 1e-2 * np.eye(6)) for pose in (above, gtsam.Pose3()))
+    assert consistency.error_series(*paths, dof).nees_position[0] == pytest.approx(nees)

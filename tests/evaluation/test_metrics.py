@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import metrics
+from sonar_graph.evaluation.consistency import error_series
+from sonar_graph.evaluation.scores import ScoredWords, trajectory_scores
 from sonar_graph.states import LandmarkMap, Trajectory
 
 seeds = st.integers(0, 2**32 - 1)
@@ -62,15 +64,12 @@ def evo_rmse(
     return metric.get_statistic(StatisticsType.rmse)
 
 
-@settings(max_examples=20)
-@given(seeds)
-def test_ate_agrees_with_evo(seed):
-    truth = random_walk(seed)
-    estimate = moved(
-        disturbed(truth, seed + 1), Rotation.from_euler("z", 0.4), (1.0, 2.0, 3.0)
-    )
-    raw = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), as_evo(estimate))
-    assert metrics.ate_raw_m(estimate, truth) == pytest.approx(raw, abs=1e-9)
+def scored(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """Values of the scores of a path, as a comparison gives them."""
+    errors = error_series(estimate, truth, 3)
+    words = ScoredWords("all", "not aligned", "3-D position error")
+    scores = trajectory_scores("causal", estimate, truth, errors, words)
+    return {key.removeprefix("causal."): one.value for key, one in scores.items()}
 
 
 def flat(trajectory: Trajectory) -> Trajectory:
@@ -82,41 +81,30 @@ def flat(trajectory: Trajectory) -> Trajectory:
 
 @settings(max_examples=20)
 @given(seeds)
-def test_errors_on_a_plane_agree_with_evo(seed):
-    truth = flat(random_walk(seed))
-    estimate = moved(
-        flat(disturbed(truth, seed + 1)), Rotation.from_euler("z", 0.4), (1.0, 2.0, 0.0)
-    )
+def test_scores_of_a_path_agree_with_evo(seed):
+    truth = random_walk(seed)
+    turn = Rotation.from_euler("z", 0.4)
+    estimate = moved(disturbed(truth, seed + 1), turn, (1.0, 2.0, 3.0))
+    spatial = scored(estimate, truth)
+    apart = {"delta": 20, "delta_unit": Unit.frames, "all_pairs": True}
+    for key, metric in (
+        ("ate_raw_m", APE(PoseRelation.translation_part)),
+        ("rpe_10s_m", RPE(PoseRelation.translation_part, **apart)),
+    ):
+        expected = evo_rmse(metric, as_evo(truth), as_evo(estimate))
+        assert spatial[key] == pytest.approx(expected, abs=1e-9)
+    # on a plane the best motion is that of SE(2), and a rotation is one of heading
+    truth = flat(truth)
+    estimate = moved(flat(disturbed(truth, seed + 1)), turn, (1.0, 2.0, 0.0))
+    planar = scored(estimate, truth)
     aligned = as_evo(estimate)
     aligned.align(as_evo(truth))
-    se2 = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), aligned)
-    assert metrics.ate_se2_m(estimate, truth) == pytest.approx(se2, abs=1e-9)
-    turns = RPE(
-        PoseRelation.rotation_angle_rad, delta=2, delta_unit=Unit.frames, all_pairs=True
-    )
+    expected = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), aligned)
+    assert planar["ate_se2_m"] == pytest.approx(expected, abs=1e-9)
+    turns = RPE(PoseRelation.rotation_angle_rad, **apart)
     expected = evo_rmse(turns, as_evo(truth), as_evo(estimate))
-    assert metrics.rmse(
-        metrics.relative_errors(estimate, truth, 1).yaw_rad
-    ) == pytest.approx(expected, abs=1e-9)
+    assert planar["rpe_10s_rad"] == pytest.approx(expected, abs=1e-9)
     assert expected > 0.01
-
-
-@settings(max_examples=20)
-@given(seeds, st.sampled_from([1, 10]))
-def test_relative_error_agrees_with_evo(seed, delta_s):
-    truth = random_walk(seed)
-    estimate = disturbed(truth, seed + 1)
-    frames = delta_s * 1_000_000_000 // STEP_NS
-    evo = RPE(
-        PoseRelation.translation_part,
-        delta=frames,
-        delta_unit=Unit.frames,
-        all_pairs=True,
-    )
-    expected = evo_rmse(evo, as_evo(truth), as_evo(estimate))
-    relative = metrics.relative_errors(estimate, truth, delta_s)
-    assert metrics.rmse(relative.translation_m) == pytest.approx(expected, abs=1e-9)
-    assert len(relative) == len(truth) - frames
 
 
 def line(yaws: list[float], positions: list[list[float]]) -> Trajectory:
@@ -128,18 +116,18 @@ def line(yaws: list[float], positions: list[list[float]]) -> Trajectory:
 
 def test_errors_by_hand():
     """Height, which the plane leaves out; yaw across half a turn."""
-    truth = line([0.0] * 4, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    estimate = line([0.0] * 4, [[0, 0, 1], [1, 0, 1], [1, 1, -1], [0, 1, -1]])
-    assert metrics.ate_raw_m(estimate, truth) == pytest.approx(1.0)
-    assert metrics.ate_yaw_m(estimate, truth) == pytest.approx(1.0)
-    assert metrics.ate_se2_m(estimate, truth) == pytest.approx(0.0, abs=1e-12)
-    truth = line([np.pi - 0.01] * 3, [[0, 0, 0], [5, 0, 0], [0, 0, 0]])
-    estimate = line([-np.pi + 0.02] * 3, [[1, 1, 0], [9, 9, 9], [1.3, 1.4, 0]])
-    np.testing.assert_allclose(
-        metrics.yaw_errors_rad(estimate, truth), [0.03] * 3, atol=1e-12
+    square = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    truth = line([np.pi - 0.01] * 4, [[*at, 0] for at in square])
+    heights = (1, 1, -1, -1)
+    estimate = line(
+        [-np.pi + 0.02] * 4, [[*at, z] for at, z in zip(square, heights, strict=True)]
     )
+    found = scored(estimate, truth)
+    assert found["ate_raw_m"] == found["ate_yaw_m"] == pytest.approx(1.0)
+    assert found["ate_se2_m"] == pytest.approx(0.0, abs=1e-12)
+    assert found["yaw_rmse_rad"] == pytest.approx(0.03)
     with pytest.raises(EvaluationError, match=r"Trajectory\.at"):
-        metrics.ate_raw_m(truth.rows(slice(1, None)), truth)
+        scored(truth.rows(slice(1, None)), truth)
 
 
 @pytest.mark.parametrize(

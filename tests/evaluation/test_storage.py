@@ -1,6 +1,7 @@
 import json
+import re
 import zipfile
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from sonar_graph.evaluation import (
     read_comparison,
     write_comparison,
 )
-from sonar_graph.report import write_report
+from sonar_graph.files import COMPARISON, replacing, result_written
 
 from .conftest import Offset, straight_sequence
 
@@ -39,20 +40,13 @@ def folder(comparison, tmp_path) -> Path:
 def assert_same(left: Any, right: Any, where: str = "") -> None:
     """Equal all the way down; arrays exactly, NaN equal to NaN."""
     if is_dataclass(left):
-        for field in fields(left):
-            assert_same(
-                getattr(left, field.name),
-                getattr(right, field.name),
-                f"{where}.{field.name}",
-            )
-    elif isinstance(left, dict):
+        left, right = vars(left), vars(right)
+    if isinstance(left, list):
+        left, right = dict(enumerate(left)), dict(enumerate(right))
+    if isinstance(left, dict):
         assert list(left) == list(right), where
         for key in left:
             assert_same(left[key], right[key], f"{where}[{key}]")
-    elif isinstance(left, list):
-        assert len(left) == len(right), where
-        for index, pair in enumerate(zip(left, right, strict=True)):
-            assert_same(*pair, f"{where}[{index}]")
     elif isinstance(left, (np.ndarray, float)):
         np.testing.assert_array_equal(left, right, err_msg=where)
     else:
@@ -63,36 +57,25 @@ def test_reading_returns_what_was_written(comparison, folder):
     restored = read_comparison(folder)
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
         assert_same(getattr(comparison, name), getattr(restored, name), name)
-    for name in (
-        "name",
-        "notes",
-        "truth",
-        "true_landmarks",
-        "detections",
-        "start_ns",
-        "end_ns",
-    ):
-        assert_same(
-            getattr(comparison.sequence, name), getattr(restored.sequence, name), name
-        )
+    names = "name notes truth true_landmarks detections start_ns end_ns"
+    for name in names.split():
+        values = [getattr(one.sequence, name) for one in (comparison, restored)]
+        assert_same(*values, name)
     assert restored.sequence.calibration == comparison.sequence.calibration
     assert isinstance(restored.sequence.calibration, Calibration)
 
 
-def test_json_is_strict_and_tells_units_and_protocol(folder):
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
-    index = json.loads(
-        (folder / "comparison.json").read_text("utf-8"), parse_constant=refuse
-    )
-    score = index["runs"]["offset"]["scores"]["causal.ate_raw_m"]
+def test_json_is_strict_and_has_units_and_protocol(folder):
+    text = (folder / "comparison.json").read_text("utf-8")
+    assert not re.search(r"\b(NaN|Infinity)\b", text)
+    runs = json.loads(text)["runs"]
+    score = runs["offset"]["scores"]["causal.ate_raw_m"]
     assert score["value"] == pytest.approx(0.4)
     assert score["unit"] == "m"
     assert "not aligned" in score["protocol"]
-    assert index["runs"]["offset"]["params"]["offset_m"] == 0.4
-    assert index["runs"]["broken"]["status"] == "failed"
-    assert "diverged" in index["runs"]["broken"]["reason"]
+    assert runs["offset"]["params"]["offset_m"] == 0.4
+    assert runs["broken"]["status"] == "failed"
+    assert "diverged" in runs["broken"]["reason"]
 
 
 def test_a_result_folder_is_readable_without_this_package(
@@ -133,16 +116,17 @@ def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
     ]
 
 
-@pytest.mark.usefixtures("unrendered")
 def test_no_page_of_an_earlier_comparison_stays_beside_later_numbers(
-    comparison, tmp_path
+    comparison, folder
 ):
-    write_report(comparison, tmp_path)
-    write_comparison(comparison, tmp_path)
-    assert not (tmp_path / "report.html").exists()
-    (tmp_path / "report.html").write_text("mine")
-    write_comparison(comparison, tmp_path)
-    assert (tmp_path / "report.html").read_text() == "mine"
+    page = folder / "report.html"
+    with result_written(folder, COMPARISON), replacing(page) as partial:
+        partial.write_text("an earlier page")
+    write_comparison(comparison, folder)
+    assert not page.exists()
+    page.write_text("mine")
+    write_comparison(comparison, folder)
+    assert page.read_text() == "mine"
 
 
 def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(
@@ -189,8 +173,6 @@ def test_damage_is_named(folder, file, content, named):
     path = folder / file
     if isinstance(content, bytes):
         path.write_bytes(content)
-    elif content is None:
-        path.unlink()
     else:
         with np.load(path) as archive:
             kept = {name: archive[name] for name in archive.files if name != content}

@@ -80,18 +80,11 @@ def test_a_single_estimator_is_not_called_the_nearest():
     assert "nearest" in sentences.headline(scored(isam2=0.1, ekf_slam=0.2))
 
 
-def test_aligned_errors_come_first_in_the_terminal_in_a_known_map_too():
-    """So that the numbers of two dives are of one kind."""
-    comparison = basin_comparison(60)
-    known = KnownMap.of([1], [[0.0, 0.0, 0.0]], sigma_m=0.1)
-    calibration = comparison.sequence.calibration.model_copy(update={"map": known})
-    sequence = replace(comparison.sequence, calibration=calibration)
-    texts = [printed(comparison), printed(replace(comparison, sequence=sequence))]
-    for text in texts:
-        heads = text.splitlines()[2].split()
-        assert heads[:3] == ["aligned", "aligned", "raw"]
-        assert "aligned: Horizontal position error, SE(2) aligned" in text
-        assert "raw: Position error, not aligned" in text
+def test_aligned_errors_come_first_in_the_terminal():
+    text = printed(basin_comparison(60))
+    assert text.splitlines()[2].split()[:3] == ["aligned", "aligned", "raw"]
+    assert "aligned: Horizontal position error, SE(2) aligned" in text
+    assert "raw: Position error, not aligned" in text
 
 
 def test_a_failure_is_printed_with_its_reason():
@@ -105,23 +98,14 @@ def test_a_failure_is_printed_with_its_reason():
 
 
 @pytest.mark.parametrize(
-    ("value", "interval", "shown"),
-    [
-        *((2.1, None, "2.10"), (0.4, None, "0.400"), (0.4, (0.9, 1.1), "0.400 ▼")),
-        *((1.3, (0.9, 1.1), "1.30 ▲"), (2.1, (0.9, 2.2), "2.10")),
-    ],
+    ("value", "shown"), [(0.4, "0.400 ▼"), (1.3, "1.30 ▲"), (1.0, "1 ")]
 )
-def test_a_nees_is_marked_outside_its_interval_and_never_without(
-    value, interval, shown
-):
-    text = printed(
-        with_score(
-            basin_comparison(60), "isam2", "causal.nees_yaw", nees(value, interval)
-        )
-    )
+def test_a_nees_outside_its_interval_is_marked(value, shown):
+    key = "causal.nees_yaw"
+    marked = with_score(basin_comparison(60), "isam2", key, nees(value, (0.9, 1.1)))
+    text = printed(marked)
     row = next(line for line in text.splitlines() if "isam2" in line)
     assert shown in row
-    assert any(mark in shown for mark in "▲▼") or not re.search(f"{shown} [▲▼]", row)
     assert "▲ over-confident, ▼ over-cautious" in text
 
 
@@ -212,42 +196,25 @@ def test_without_detections_the_drift_is_explained():
     assert "no ground truth" in sentences.headline(replace(blind, scores={}))
 
 
-@pytest.mark.parametrize(
-    ("gated", "params", "advice"),
-    [
-        (19, {}, None),
-        (21, {}, "identities are wrong, or noise is set far too small"),
-    ],
-)
-def test_an_estimator_that_rejects_a_fifth_is_called_lost(gated, params, advice):
+@pytest.mark.parametrize("gated", [19, 21])
+def test_an_estimator_that_rejects_a_fifth_is_called_lost(gated):
     log = log_of([Outcome.GATED] * gated + [Outcome.USED] * (100 - gated), [0.1] * 100)
     comparison = basin_comparison(60)
-    lost = with_run(
-        comparison, replace(comparison.runs[1], detections=log, params=params)
-    )
+    run = replace(comparison.runs[1], detections=log, params={})
+    lost = with_run(comparison, run)
     told = sentences.lost_runs(lost)
     assert sentences.doubts(lost)[: len(told)] == told
-    assert len(told) == (advice is not None)
+    assert len(told) == (gated > 20)
     for sentence in told:
-        assert sentence.startswith(
-            f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its"
-        )
-        assert advice in sentence
-    by_map = replace(
-        lost.runs[1],
-        withheld=[
-            "landmarks 1..4: sightings contradict the map, and too few others agree"
-        ],
-    )
-    assert sentences.lost_runs(with_run(lost, by_map)) == []
-    few = replace(
-        log,
-        innovations=np.full((100, 2), 0.1),
-        innovation_covs=np.tile(np.eye(2), (100, 1, 1)),
-    )
-    assert detection_scores(few)["detections.nis"].verdict == (
-        "" if told else "over-cautious"
-    )
+        assert sentence.startswith(f"ekf-slam refused {gated} of 100 detections")
+        assert "identities are wrong, or noise is set far too small" in sentence
+    told_by_map = ["sightings contradict the map, and too few others agree"]
+    by_map = with_run(lost, replace(run, withheld=told_by_map))
+    assert sentences.lost_runs(by_map) == []
+    # few squares are below 1: inside the gate they mean nothing
+    near = replace(log, innovation_covs=np.tile(np.eye(2), (100, 1, 1)))
+    verdict = detection_scores(near)["detections.nis"].verdict
+    assert verdict == ("" if told else "over-cautious")
 
 
 def with_map(
@@ -301,7 +268,6 @@ def test_a_map_is_wrong_beyond_its_quantile():
     )
 
 
-@pytest.mark.usefixtures("unrendered")
 def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
     comparison = with_map(IDS, [0.0, 0.05, 5.0, 0.01])
     line = (
@@ -310,8 +276,7 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
     )
     assert sentences.doubt_of_identities(comparison) == [line]
     assert line in printed(comparison, 200)
-    page = render_report(comparison)
-    assert page.index("puts landmark 3 far outside") < page.index("<nav")
+    assert line in sentences.doubts(comparison)
 
 
 def test_without_true_landmarks_the_innovations_of_used_detections_tell():
@@ -371,47 +336,31 @@ def test_a_log_without_any_identity_is_told_with_what_to_do(outcomes, count):
     assert (line in printed(blind, 200)) == bool(count)
 
 
-@pytest.mark.usefixtures("unrendered")
 def test_landmarks_without_a_name_are_counted_and_scored_by_place():
-    nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.02, 3.0, 0.01])
+    unnamed = np.arange(4) + FIRST_ANONYMOUS_ID
+    nameless = with_map(unnamed, [0.01, 0.02, 3.0, 0.01])
     sentence = "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2 and 4."
     assert sentences.nameless_landmarks(nameless) == [sentence]
     assert sentence in printed(nameless, 200)
-    assert sentence in render_report(nameless)
-    table = landmark_table(nameless)
-    assert [row[2].text != ABSENT for row in table.rows[:8:2]] == [
-        True,
-        True,
-        False,
-        True,
+    rows = landmark_table(nameless).rows[:8:2]
+    assert [row[2].text != ABSENT for row in rows] == [True, True, False, True]
+    raw = landmark_scores(nameless.runs[0].landmarks, nameless.sequence)[
+        "landmarks.raw_m"
     ]
-    scores = landmark_scores(nameless.runs[0].landmarks, nameless.sequence)
-    assert scores["landmarks.raw_m"].value == pytest.approx(
-        np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3)
-    )
-    assert (
-        "3 landmarks matched by identity, 3 of them by place within 1 m"
-        in scores["landmarks.raw_m"].protocol
-    )
-    # the third belongs to no landmark
-    off = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])
-    (line,) = sentences.doubt_of_identities(off)
+    assert raw.value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
+    assert "3 landmarks matched by identity, 3 of them by place" in raw.protocol
+    (line,) = sentences.doubt_of_identities(with_map(unnamed, [0.01, 0.5, 3.0, 0.01]))
     assert "puts landmark 2 far outside its covariance" in line
-    unknown = with_map(
-        np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False
-    )
-    (line,) = sentences.nameless_landmarks(unknown)
-    assert line.startswith(
-        "isam2 found 1 landmark without a name (identity.unknown.policy); "
-    )
-    assert line.endswith("; u0 stands for identity 3000000000 in the files.")
+    one = np.array([1, 2, 3, FIRST_ANONYMOUS_ID])
+    unknown = with_map(one, [0.0] * 4, has_truth=False)
+    assert sentences.nameless_landmarks(unknown) == [
+        "isam2 found 1 landmark without a name (identity.unknown.policy); u0 stands for identity 3000000000 in the files."
+    ]
     # merely wrong, and not named by place
     wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)
     assert sentences.nameless_landmarks(wrong) == []
     scores = landmark_scores(wrong.runs[0].landmarks, wrong.sequence)
-    assert (
-        "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
-    )
+    assert "3 landmarks matched by identity (4" in scores["landmarks.raw_m"].protocol
 
 
 @pytest.mark.parametrize("is_named", [True, False])
@@ -430,38 +379,28 @@ def test_beside_a_sensor_that_is_named_no_right_one_is_to_be_left_out(is_named: 
 
 @pytest.mark.usefixtures("unrendered")
 def test_terminal_and_page_list_refused_and_withheld_rows():
-    start_ns = basin_comparison(60).sequence.start_ns
     calm = basin_comparison(60)
+    start_ns = calm.sequence.start_ns
     refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
     comparison = with_run(refused, replace(refused.runs[0], withheld=[WITHHELD]))
+    rows = [
+        f"Warning: dvl, 1.000 s: {Refusal.OUTLIER} (squared distance 513); isam2",
+        f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2",
+    ]
     line = f"Warning: isam2: {WITHHELD}"
+    assert sentences.refusal_lines(comparison) == rows
     assert sentences.withheld_lines(comparison) == [line]
     below = printed(comparison, 200)
     page = render_report(comparison)
-    assert all(line in below for line in [*sentences.refusal_lines(comparison), line])
-    assert page.index(line) < page.index("<nav")
-    section = page[page.index('id="refused"') : page.index('id="method"')]
-    for word in (
-        "dvl",
-        "1.000",
-        Refusal.OUTLIER,
-        "513",
-        "imu",
-        "0.000",
-        Refusal.LATE,
-        "isam2",
-    ):
-        assert word in section
-    assert "ekf-slam" not in section
+    assert all(one in below for one in [*rows, line])
+    assert page.index(line) < page.index("<nav") < page.index(rows[0])
     assert 'id="refused"' not in render_report(calm)
     assert "Warning" not in printed(calm, 200)
     messages = [f"{WITHHELD} {k}" for k in range(MOST_ROWS_NAMED + 2)]
-    lines = sentences.withheld_lines(
-        with_run(calm, replace(calm.runs[0], withheld=messages))
-    )
+    many = with_run(calm, replace(calm.runs[0], withheld=messages))
+    lines = sentences.withheld_lines(many)
     assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: comparison.json has all"
-    assert sentences.withheld_lines(calm) == []
     same = replace(calm, runs=[replace(run, withheld=[WITHHELD]) for run in calm.runs])
     (line,) = sentences.withheld_lines(same)
     assert line == f"Warning: {', '.join(r.estimator for r in calm.runs)}: {WITHHELD}"
@@ -500,15 +439,11 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
     (line,) = said(6)
     told = "Warning: sonar, detections that were used although as far off as one in a billion should be: "
     assert line.startswith(f"{told}isam2 6 of 100: look at their ranges")
-    assert line in printed(
-        with_map(IDS, [0.0] * 4, detections=log_of([Outcome.USED] * 9, [1.0] * 9)), 300
-    ).replace("9 of 9", "6 of 100")
     limit_m = SIGMA_M * np.sqrt(sentences.ABSURD)
     assert not said(5)
     assert not said(6, Outcome.GATED)
     assert not said(6, off_m=0.999 * limit_m)
     assert said(6, off_m=1.001 * limit_m)
-    assert not sentences.outliers(with_map(IDS, [0.0] * 4, detections=log_of([], [])))
 
 
 def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_write():
@@ -557,24 +492,20 @@ def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_
 def test_runs_that_agree_with_each_other_and_not_with_the_truth_share_a_fault(
     off_m, is_said
 ):
-    comparison = basin_comparison(60)
-    names = [run.estimator for run in comparison.runs if run.detections is not None]
-    for name in names:
+    def moved(comparison: Comparison, name: str, off_m: float) -> Comparison:
         errors = comparison.errors[name]["causal"]
-        same = replace(errors, position_m=np.full_like(errors.position_m, off_m))
-        comparison = with_score(
-            comparison, name, "causal.ate_se2_m", Score(off_m, "m", "By hand.")
-        )
-        both = comparison.errors[name] | {"causal": same}
-        comparison = replace(comparison, errors=comparison.errors | {name: both})
+        moved_m = np.full_like(errors.position_m, off_m)
+        series = {"causal": replace(errors, position_m=moved_m)}
+        score = Score(off_m, "m", "By hand.")
+        scored = with_score(comparison, name, "causal.ate_se2_m", score)
+        return replace(scored, errors=scored.errors | {name: series})
+
+    comparison = basin_comparison(60)
+    for name in ("isam2", "ekf-slam"):
+        comparison = moved(comparison, name, off_m)
     said = sentences.shared_error(comparison)
     assert bool(said) == is_said
     if said:
         assert "agree to 0 m, and are 2 m off the truth" in said[0]
         # estimators that differ have faults of their own
-        name = names[0]
-        errors = comparison.errors[name]["causal"]
-        apart = replace(errors, position_m=errors.position_m + 1.0)
-        both = comparison.errors[name] | {"causal": apart}
-        other = replace(comparison, errors=comparison.errors | {name: both})
-        assert sentences.shared_error(other) == []
+        assert sentences.shared_error(moved(comparison, "isam2", off_m + 1)) == []

@@ -28,25 +28,21 @@ def innovation_figure(comparison: Comparison) -> Figure | None:
         # refused detections are drawn apart from used ones
         is_gated = np.array([one is Outcome.GATED for one in log.outcomes], dtype=bool)
         seconds = style.seconds_since_start(comparison, log.stamps_ns)
-        for panel, innovations in zip(panels, log.innovations.T, strict=True):
+        # people read azimuths in degrees
+        shown = (log.innovations[:, 0], np.degrees(log.innovations[:, 1]))
+        look = {"color": style.INK, "markersize": 3.5, "label": "refused by the gate"}
+        for panel, innovations in zip(panels, shown, strict=True):
             for is_refused in (False, True):
-                chosen = is_predicted & (is_gated == is_refused)
+                chosen = np.flatnonzero(is_predicted & (is_gated == is_refused))
                 values = innovations[chosen]
-                # the second row is the azimuth, which people read in degrees
-                if panel is panels[-1]:
-                    values = np.degrees(values)
                 # an even choice shows the noise, the extremes show what was refused
-                rows = np.union1d(
-                    style.evenly(len(values), style.SERIES_POINTS // 2),
-                    style.thinned(values, style.SERIES_POINTS // 20),
-                )
-                x = seconds[chosen][rows]
+                even = style.evenly(len(values), style.SERIES_POINTS // 2)
+                extreme = style.thinned(values, style.SERIES_POINTS // 20)
+                rows = chosen[np.union1d(even, extreme)]
                 if is_refused:
-                    look = {"color": style.INK, "markersize": 3.5}
-                    label = "refused by the gate"
-                    panel.plot(x, values[rows], "x", label=label, **look)
+                    panel.plot(seconds[rows], innovations[rows], "x", **look)
                 else:
-                    style.dots(panel, x, values[rows], own, label="used")
+                    style.dots(panel, seconds[rows], innovations[rows], own, "used")
             panel.axhline(0.0, color=style.MUTED, linewidth=0.7)
     axes[0, 0].set_ylabel("range (m)")
     axes[1, 0].set_ylabel("azimuth (°)")

@@ -6,13 +6,18 @@ a common scale would flatten the others.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sonar_graph.evaluation import Comparison, ErrorSeries, RunResult, yaw_rad
+from sonar_graph.evaluation import (
+    Comparison,
+    ErrorSeries,
+    RunResult,
+    anees_interval,
+    yaw_rad,
+)
 from sonar_graph.measurements import Floats
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.report import figure_style as style
@@ -37,30 +42,26 @@ def error_figure(comparison: Comparison) -> Figure | None:
     series = _causal_errors(comparison)
     if not series:
         return None
-    sizes = {index: _sizes(errors) for index, errors in series.items()}
     labels = ["position error (m)", "yaw error (°)"][: 1 + has_yaw(comparison)]
     size_in = style.size_in(len(labels))
     figure, axes = style.blank_panels(
         len(labels), 2, size_in, sharex="col", sharey="row"
     )
-    for index, errors in series.items():
-        run = comparison.runs[index]
-        seconds = style.seconds_since_start(comparison, errors.stamps_ns)
-        for row, panels in enumerate(axes):
-            error = sizes[index][row]
-            rows = style.thinned(error, style.SERIES_POINTS // 2)
-            look = style.run_look(index, 1.2)
-            for panel, along in zip(
-                panels, (seconds, distance_m(run, errors)), strict=True
-            ):
-                panel.plot(along[rows], error[rows], label=run.estimator, **look)
     for row, label in enumerate(labels):
+        sizes = {index: _sizes(errors)[row] for index, errors in series.items()}
+        for index, error in sizes.items():
+            run = comparison.runs[index]
+            errors = series[index]
+            seconds = style.seconds_since_start(comparison, errors.stamps_ns)
+            rows = style.thinned(error, style.SERIES_POINTS // 2)
+            look = style.run_look(index, 1.2) | {"label": run.estimator}
+            axes[row, 0].plot(seconds[rows], error[rows], **look)
+            axes[row, 1].plot(distance_m(run, errors)[rows], error[rows], **look)
         # one scale for all, or a small error would look like a large one
-        limit = shared_limit([both[row] for both in sizes.values()])
-        axes[row, 0].set_ylim(0.0, ROOM * limit)
-        axes[row, 0].set_ylabel(label)
-    for column, label in enumerate((style.TIME_LABEL, DISTANCE_LABEL)):
-        axes[-1, column].set_xlabel(label)
+        limit = ROOM * shared_limit(list(sizes.values()))
+        axes[row, 0].set(ylim=(0.0, limit), ylabel=label)
+    axes[-1, 0].set_xlabel(style.TIME_LABEL)
+    axes[-1, 1].set_xlabel(DISTANCE_LABEL)
     style.legend_above(figure, axes[0, 0])
     return figure
 
@@ -83,27 +84,22 @@ def distance_m(run: RunResult, errors: ErrorSeries) -> Floats:
 def shared_limit(sizes: list[Floats]) -> float:
     """Upper end of a common axis: the largest error of all runs, at most `LARGER` times that of the best run."""
     # a run without an error of this kind has NaN throughout
-    largest = [
-        float(np.nanmax(values)) for values in sizes if np.isfinite(values).any()
-    ]
-    return max(min(max(largest, default=0.0), LARGER * min(largest, default=0.0)), 1e-9)
+    known = [values for values in sizes if np.isfinite(values).any()]
+    largest = [float(np.nanmax(values)) for values in known] or [0.0]
+    return max(min(max(largest), LARGER * min(largest)), 1e-9)
 
 
 def errors_cut_off(comparison: Comparison) -> list[str]:
     """Names of runs with an error that leaves the picture."""
-    series = _causal_errors(comparison)
-    largest = np.array(
-        [
-            [np.nanmax(own, initial=0.0) for own in _sizes(errors)]
-            for errors in series.values()
-        ]
-    ).reshape(-1, 2)  # (runs, position and heading)
-    limits = [ROOM * shared_limit(list(column[:, None])) for column in largest.T]
-    is_cut = np.any(largest > limits, axis=1).tolist()
+    sizes = {i: _sizes(errors) for i, errors in _causal_errors(comparison).items()}
+    # of position and of heading
+    limits = [
+        ROOM * shared_limit(list(own)) for own in zip(*sizes.values(), strict=True)
+    ]
     return [
         comparison.runs[index].estimator
-        for index, is_out in zip(series, is_cut, strict=True)
-        if is_out
+        for index, both in sizes.items()
+        if any(np.any(own > most) for own, most in zip(both, limits, strict=True))
     ]
 
 
@@ -122,20 +118,15 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
     # columns beside each other are narrow: fewer points are seen
     points = style.SERIES_POINTS // min(len(series), 2)
     for row, label in enumerate(labels):
-        limit = 0.0
-        drawn = []
-        for index, errors in series.items():
+        sizes = []
+        for panel, (index, errors) in zip(axes[row], series.items(), strict=True):
             error = np.degrees(errors.yaw_rad)  # (n,)
             sigma = np.degrees(errors.yaw_sigma_rad)  # (n,)
             if row < axes_count:
                 error = errors.position_m[:, row]
                 sigma = errors.position_sigma_m[:, row]
-            drawn.append((index, errors, error, BAND_SIGMAS * sigma))
-        limit = ROOM * shared_limit(
-            [np.fmax(np.abs(error), half) for _, _, error, half in drawn]
-        )
-        axes[row, 0].set(ylim=(-limit, limit), ylabel=label)
-        for panel, (index, errors, error, half) in zip(axes[row], drawn, strict=True):
+            half = BAND_SIGMAS * sigma
+            sizes.append(np.fmax(np.abs(error), half))
             seconds = style.seconds_since_start(comparison, errors.stamps_ns)
             own = style.colour(index)
             # an estimator may report no covariance
@@ -147,6 +138,8 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
             rows = style.thinned(error, points)
             panel.axhline(0.0, color=style.MUTED, linewidth=0.7)
             panel.plot(seconds[rows], error[rows], color=own, linewidth=1.1)
+        limit = ROOM * shared_limit(sizes)
+        axes[row, 0].set(ylim=(-limit, limit), ylabel=label)
     for panel, last, index in zip(axes[0], axes[-1], series, strict=True):
         style.head_panel(panel, comparison.runs[index].estimator, style.colour(index))
         last.set_xlabel(style.TIME_LABEL)
@@ -155,22 +148,18 @@ def bounds_figure(comparison: Comparison) -> Figure | None:
 
 def yaw_figure(comparison: Comparison) -> Figure | None:
     """Heading of truth and causal estimates over time, wrapped to ±180°."""
-    truth = comparison.sequence.true_poses
-    looks: dict[str, dict[str, Any]] = {
-        run.estimator: style.run_look(index, 1.2)
+    drawn = [
+        (run.estimator, run.causal, style.run_look(index, 1.2))
         for index, run in enumerate(comparison.runs)
-        if run.causal is not None and len(run.causal)
-    }
-    if not looks:
+        if run.causal
+    ]
+    if not drawn:
         return None
-    figure, panel = style.one_panel()
-    paths = {run.estimator: run.causal for run in comparison.runs}
-    if truth is not None and len(truth):
-        looks = {"truth": style.TRUTH_LOOK} | looks
-        paths["truth"] = truth
-    for name, look in looks.items():
-        path = paths[name]
-        assert path is not None, "runs without a path have no look"
+    if truth := comparison.sequence.true_poses:
+        drawn = [("truth", truth, style.TRUTH_LOOK), *drawn]
+    figure, axes = style.blank_panels(1, 1, style.size_in(1))
+    panel = axes[0, 0]
+    for name, path, look in drawn:
         panel.plot(*_headings(comparison, path), label=name, **look)
     panel.set(ylim=(-185, 185), yticks=[-180, -90, 0, 90, 180])
     panel.set(xlabel=style.TIME_LABEL, ylabel="yaw (°)")
@@ -187,27 +176,24 @@ def nees_figure(comparison: Comparison) -> Figure | None:
     }
     if not series:
         return None
-    position_dof = next(iter(series.values())).position_dof
-    per_dof = {
-        "position": {i: one.nees_position / position_dof for i, one in series.items()},
-        "yaw": {index: errors.nees_yaw for index, errors in series.items()},
-    }
-    if not np.isfinite([*per_dof["yaw"].values()]).any():
-        del per_dof["yaw"]
-    size_in = style.size_in(len(per_dof), 2.1)
-    figure, axes = style.blank_panels(
-        len(per_dof), 1, size_in, sharex=True, sharey=True
-    )
-    for panel, (label, values) in zip(axes[:, 0], per_dof.items(), strict=True):
+    dofs = {"position": next(iter(series.values())).position_dof, "yaw": 1}
+    if not np.isfinite([errors.nees_yaw for errors in series.values()]).any():
+        del dofs["yaw"]
+    size_in = style.size_in(len(dofs), 2.1)
+    figure, axes = style.blank_panels(len(dofs), 1, size_in, sharex=True, sharey=True)
+    for panel, (label, dof) in zip(axes[:, 0], dofs.items(), strict=True):
         style.logarithmic(panel, "y")
         # chi-square with the degrees of freedom of the error
-        low, high = _band(position_dof if label == "position" else 1)
+        low, high = anees_interval(1, dof, BAND_PROBABILITY)
         panel.axhspan(low, high, color=style.TRUTH, alpha=0.25, linewidth=0)
         panel.axhline(1.0, color=style.MUTED, linewidth=0.7)
         inside: list[str] = []
-        for index, nees in values.items():
+        for index, errors in series.items():
             name = comparison.runs[index].estimator
-            seconds = style.seconds_since_start(comparison, series[index].stamps_ns)
+            seconds = style.seconds_since_start(comparison, errors.stamps_ns)
+            nees = (
+                errors.nees_position if label == "position" else errors.nees_yaw
+            ) / dof
             _draw_nees(panel, seconds, nees, index, name)
             known = nees[np.isfinite(nees)]
             if known.size:
@@ -223,11 +209,12 @@ def nees_figure(comparison: Comparison) -> Figure | None:
 
 def _causal_errors(comparison: Comparison) -> dict[int, ErrorSeries]:
     """Causal errors by the index of the run, where there are any."""
-    found = {
-        index: comparison.errors.get(run.estimator, {}).get("causal")
+    return {
+        index: errors
         for index, run in enumerate(comparison.runs)
+        if (errors := comparison.errors.get(run.estimator, {}).get("causal"))
+        and len(errors.yaw_rad)
     }
-    return {i: errors for i, errors in found.items() if errors and len(errors.yaw_rad)}
 
 
 def has_yaw(comparison: Comparison) -> bool:
@@ -245,13 +232,6 @@ def _headings(comparison: Comparison, path: Trajectory) -> tuple[Floats, Floats]
     # a NaN interrupts the line, which else crosses the panel at every turn past 180°
     jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
     return np.insert(seconds, jumps, np.nan), np.insert(degrees, jumps, np.nan)
-
-
-def _band(dof: int) -> tuple[float, float]:
-    """The values per degree of freedom between which those of a consistent estimator are in `BAND_PROBABILITY`."""
-    tail = (1 - BAND_PROBABILITY) / 2
-    low = chi_square_quantile(tail, dof) / dof
-    return low, chi_square_quantile(1 - tail, dof) / dof
 
 
 def _draw_nees(

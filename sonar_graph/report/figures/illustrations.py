@@ -145,9 +145,9 @@ def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]
 
 def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illustration:
     """One figure of the page; a map is drawn in two widths, and the page shows the one that fits."""
-    # a map is drawn twice, because its names cannot be shrunk to a phone
     widths_in = {"": HALF_WIDTH_IN if drawing.columns > 1 else PHONE_WIDTH_IN}
     described = f"{drawing.title}. {drawing.caption}"
+    # a map is drawn twice, because its names cannot be shrunk to a phone
     if drawing.draw is map_figure:
         widths_in = {"": HALF_WIDTH_IN, PHONE: PHONE_WIDTH_IN}
         finding = sentences.headline(comparison, aligned=comparison.is_aligned)
@@ -183,34 +183,31 @@ def _captions(comparison: Comparison) -> dict[str, str]:
     )
     if is_repeated:
         *others, last = (f"{time_s:.1f}" for time_s in MAP_TIMES_S)
+        times = f"{', '.join(others)} and {last} s"
         if abs(comparison.sequence.duration_s - DURATION_S) < 1:
-            growth += (
-                f" T are the instants nearest to its {', '.join(others)} and {last} s."
-            )
+            growth += f" T are the instants nearest to its {times}."
         else:
-            growth += f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
+            growth += f" T are the same fractions of this run as its {times} of {DURATION_S:.1f} s."
     has_map = comparison.sequence.true_landmarks is not None or any(
-        run.landmarks is not None and len(run.landmarks) for run in comparison.runs
+        run.landmarks for run in comparison.runs
     )
     landmarks = f" Ellipses hold 95 %{as_large}."
     line = "" if comparison.is_aligned else located_line(comparison)
     located = line.replace("map:", "map (star):", 1)
     gone = paths_cut_off(comparison)
-    far = error_figures.errors_cut_off(comparison)
-    return {
-        "map": (
-            f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)} {located}".rstrip()
-        ),
+    has_yaw = error_figures.has_yaw(comparison)
+    in_words = {
+        "world": world,
+        "and_heading": ", and size of the causal heading's error" * has_yaw,
+        "cut": _leaving(error_figures.errors_cut_off(comparison)),
+    }
+    captions = {
+        name: DRAWINGS[name].caption.format(**in_words)
+        for name in ("errors", "bounds", "nees")
+    }
+    return captions | {
+        "map": f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)} {located}".rstrip(),
         "growth": growth,
-        "errors": DRAWINGS["errors"].caption.format(
-            world=world,
-            and_heading=", and size of the causal heading's error"
-            if error_figures.has_yaw(comparison)
-            else "",
-            cut=_leaving(far),
-        ),
-        "bounds": DRAWINGS["bounds"].caption.format(world=world),
-        "nees": DRAWINGS["nees"].caption.format(world=world),
         "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
     }
 

@@ -51,41 +51,54 @@ def map_figure(comparison: Comparison) -> Figure | None:
     view = view if factor == 1 else with_room(view)
     figure, axes = style.blank_panels(1, 1, (style.width_in(), style.width_in()))
     panel: Axes = axes[0, 0]
-    truth = comparison.sequence.truth
+    look: dict[str, Any] = {"color": style.INK, "markersize": 9, "markeredgewidth": 1.4}
+    draw_path(
+        panel, comparison.sequence.truth, label="truth", zorder=1, **style.TRUTH_LOOK
+    )
     # in the world of the estimates, as paths are
-    true_landmarks = true_landmarks_drawn(comparison)
-    look: dict[str, Any]
-    if truth is not None and len(truth):
-        panel.plot(*horizontal(truth), label="truth", zorder=1, **style.TRUTH_LOOK)
-    if true_landmarks is not None and len(true_landmarks):
-        look = {"color": style.INK, "markersize": 9, "markeredgewidth": 1.4}
-        x_y = true_landmarks.positions.T[:2]
-        panel.plot(*x_y, "+", label="true landmarks", zorder=5, **look)
+    if true := true_landmarks_drawn(comparison):
+        draw_points(panel, true, "+", label="true landmarks", zorder=5, **look)
     for index, run in enumerate(comparison.runs):
         own = style.colour(index)
-        if run.causal is not None and len(run.causal):
-            look = style.run_look(index, 1.3)
-            panel.plot(*horizontal(run.causal), label=run.estimator, zorder=3, **look)
-        if run.smoothed is not None and smoothed_differs(run):
+        look = style.run_look(index, 1.3)
+        draw_path(panel, run.causal, label=run.estimator, zorder=3, **look)
+        if smoothed_differs(run):
             look = {"linestyle": (0, (1, 1)), "linewidth": 1.9, "alpha": 0.75}
             look |= {"label": f"{run.estimator}, smoothed", "color": own, "zorder": 2}
-            panel.plot(*horizontal(run.smoothed), **look)
-        if run.landmarks is not None and len(run.landmarks):
+            draw_path(panel, run.smoothed, **look)
+        if run.landmarks:
             look = {"markersize": 3.5, "markerfacecolor": "none", "zorder": 4}
-            x_y = run.landmarks.positions.T[:2]
-            panel.plot(*x_y, "os^Dv<"[index % 6], color=own, **look)
-            for ellipse in ellipses(run.landmarks, own, factor):
-                panel.add_patch(ellipse)
+            mark = "os^Dv<"[index % 6]
+            draw_points(panel, run.landmarks, mark, color=own, **look)
+            draw_ellipses(panel, run.landmarks, own, factor)
     draw_given_map(panel, comparison)
-    view = landscape(view)
-    panel.set(xlim=view[:, 0], ylim=view[:, 1])
-    panel.set_aspect("equal", adjustable="box")
+    frame(panel, landscape(view))
     panel.set(xlabel="world x (m)", ylabel="world y (m)")
     style.legend_above(figure, panel)
     # the room for names is measured on the figure as it will be
     style.arrange(figure)
     label_landmarks(panel, comparison)
     return figure
+
+
+def draw_path(
+    panel: Axes, path: Trajectory | None, until_ns: float = math.inf, **look: Any
+) -> None:
+    """Draw at most `PATH_POINTS` poses of a path until an instant; nothing where there are none."""
+    shown = path.positions[path.stamps_ns <= until_ns, :2] if path else ()
+    if len(shown):
+        panel.plot(*shown[style.evenly(len(shown), PATH_POINTS)].T, **look)
+
+
+def draw_points(panel: Axes, landmarks: LandmarkMap, mark: str, **look: Any) -> None:
+    """Draw the places of landmarks."""
+    panel.plot(*landmarks.positions.T[:2], mark, **look)
+
+
+def frame(panel: Axes, view: Floats) -> None:
+    """Let a panel show this view, a metre as long in x as in y."""
+    panel.set(xlim=view[:, 0], ylim=view[:, 1])
+    panel.set_aspect("equal", adjustable="box")
 
 
 def landscape(view: Floats) -> Floats:
@@ -99,11 +112,7 @@ def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
     """The true landmarks in the world of the start pose; landmarks of another world are aligned to the first map."""
     true = comparison.sequence.true_landmarks
     # the first map decides, so that all are drawn in one world
-    maps = [
-        run.landmarks
-        for run in comparison.runs
-        if run.landmarks is not None and len(run.landmarks)
-    ]
+    maps = [run.landmarks for run in comparison.runs if run.landmarks]
     scored = scored_map(maps[0], comparison.sequence) if maps else None
     if true is None or scored is None or scored.alignment is None:
         return true
@@ -124,10 +133,8 @@ def paths_cut_off(comparison: Comparison) -> list[str]:
 
 def smoothed_differs(run: RunResult) -> bool:
     """True where the smoothed path is not the causal one."""
-    if run.smoothed is None or not len(run.smoothed):
-        return False
-    if run.causal is None:
-        return True
+    if not run.smoothed or run.causal is None:
+        return bool(run.smoothed)
     # a start that is found in a map gives smoothed poses where there is no causal one
     _, rows, of_causal = np.intersect1d(
         run.smoothed.stamps_ns, run.causal.stamps_ns, return_indices=True
@@ -137,80 +144,63 @@ def smoothed_differs(run: RunResult) -> bool:
 
 
 def _paths(run: RunResult) -> list[Floats]:
-    return [
-        path.positions[:, :2]
-        for path in (run.causal, run.smoothed)
-        if path is not None and len(path)
-    ]
+    return [path.positions[:, :2] for path in (run.causal, run.smoothed) if path]
 
 
 def map_view(comparison: Comparison) -> Floats | None:
     """Lower left and upper right corner of the map, shape (2, 2), metres; None where there is no path."""
     estimates = [path for run in comparison.runs for path in _paths(run)]
     sequence = comparison.sequence
-    references = (
-        [sequence.truth.positions[:, :2]]
-        if sequence.truth and len(sequence.truth)
-        else []
-    )
+    references = [path.positions[:, :2] for path in (sequence.truth,) if path]
+    if not references and not estimates:
+        return None
+    maps = [run.landmarks for run in comparison.runs if run.landmarks]
+    if true := true_landmarks_drawn(comparison):
+        references.append(true.positions[:, :2])
 
     def box(points: Floats) -> Floats:
         return np.array([np.nanmin(points, axis=0), np.nanmax(points, axis=0)])
 
-    if not references and not estimates:
-        return None
-    true = true_landmarks_drawn(comparison)
-    if true is not None and len(true):
-        references.append(true.positions[:, :2])
-    maps = [
-        run.landmarks.positions[:, :2]
-        for run in comparison.runs
-        if run.landmarks and len(run.landmarks)
-    ]
     # an estimate that diverges must not shrink the truth to a point: the truth sets the scale
     anchor = box(np.vstack(references or estimates))
-    largest = max(float(np.max(anchor[1] - anchor[0])), 1.0)
-    limits = anchor + np.array([[-1.0], [1.0]]) * MARGIN * largest
-    everything = np.vstack([anchor, *estimates, *maps])
-    shown = box(
-        np.clip(everything[np.isfinite(everything).all(axis=1)], limits[0], limits[1])
-    )
-    return shown + np.array([[-1.0], [1.0]]) * 0.04 * largest
+    largest = max(size_of(anchor), 1.0)
+    limits = widened(anchor, MARGIN * largest)
+    places = [landmarks.positions[:, :2] for landmarks in maps]
+    everything = np.vstack([anchor, *estimates, *places])
+    shown = box(np.clip(everything[np.isfinite(everything).all(axis=1)], *limits))
+    return widened(shown, 0.04 * largest)
+
+
+def size_of(view: Floats) -> float:
+    """The longer side of a view, metres."""
+    return float(np.max(view[1] - view[0]))
+
+
+def widened(view: Floats, margin_m: float) -> Floats:
+    """The view with a margin on all sides."""
+    return view + np.array([[-1.0], [1.0]]) * margin_m
 
 
 def with_room(view: Floats) -> Floats:
     """The view, widened by what the largest ellipse may need."""
-    return np.asarray(
-        view
-        + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max())
-    )
+    return widened(view, LARGEST_ELLIPSE * size_of(view))
 
 
-def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[Ellipse]:
-    """Horizontal ellipses that hold each landmark with `ELLIPSE_PROBABILITY`; none where the covariance is unknown."""
+def draw_ellipses(
+    panel: Axes, landmarks: LandmarkMap, edge: str, enlarged: float
+) -> None:
+    """Draw ellipses that hold each landmark with `ELLIPSE_PROBABILITY`; none where the covariance is unknown."""
     scale = enlarged * 2 * math.sqrt(chi_square_quantile(ELLIPSE_PROBABILITY, 2))
-    ellipses = []
-    for position, cov in zip(
-        landmarks.positions, landmarks.covariances[:, :2, :2], strict=True
-    ):
+    covs = landmarks.covariances[:, :2, :2]
+    for position, cov in zip(landmarks.positions, covs, strict=True):
         if not np.isfinite(cov).all():
             continue
         # ascending: the last direction is that of the long axis, which matplotlib calls the width
         variances, directions = np.linalg.eigh(cov)
-        width, height = scale * np.sqrt(np.maximum(variances[::-1], 0.0))
+        size = scale * np.sqrt(np.maximum(variances[::-1], 0.0))
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
-        ellipses.append(
-            Ellipse(
-                (position[0], position[1]),
-                width,
-                height,
-                angle=angle,
-                fill=False,
-                edgecolor=edge,
-                zorder=4,
-            )
-        )
-    return ellipses
+        look: dict[str, Any] = {"fill": False, "edgecolor": edge, "zorder": 4}
+        panel.add_patch(Ellipse(position[:2], *size, angle=angle, **look))
 
 
 def label_landmarks(panel: Axes, comparison: Comparison) -> None:
@@ -223,19 +213,13 @@ def label_landmarks(panel: Axes, comparison: Comparison) -> None:
         shown.append((maps[0].ids[is_shown], maps[0].positions[is_shown]))
     if not shown:
         return
-    ids = np.concatenate([own for own, _ in shown])
-    points = np.concatenate([positions[:, :2] for _, positions in shown])
+    ids, points = map(np.concatenate, zip(*shown, strict=True))
+    points = points[:, :2]
     low, high = np.array([panel.get_xlim(), panel.get_ylim()]).T
     # a name outside the view would stand at the edge of the paper
-    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-    names = [landmark_name(identity) for identity in ids[rows].tolist()]
-    style.label_points(panel, names, points[rows])
-
-
-def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
-    """World x and y of at most `PATH_POINTS` poses."""
-    rows = style.evenly(len(trajectory), PATH_POINTS)
-    return trajectory.positions[rows, 0], trajectory.positions[rows, 1]
+    is_inside = ((points >= low) & (points <= high)).all(axis=1)
+    names = [landmark_name(identity) for identity in ids[is_inside].tolist()]
+    style.label_points(panel, names, points[is_inside])
 
 
 def growth_figure(comparison: Comparison) -> Figure | None:
@@ -253,7 +237,11 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     )
     true = true_landmarks_drawn(comparison)
     truth = comparison.sequence.truth
-    marks = {"markersize": 7, "markeredgewidth": 1.2, "color": style.INK}
+    marks: dict[str, Any] = {
+        "markersize": 7,
+        "markeredgewidth": 1.2,
+        "color": style.INK,
+    }
     for panels, (index, run) in zip(axes, runs.items(), strict=True):
         own = style.colour(index)
         panels[0].set_ylabel(f"{run.estimator}\nworld y (m)")
@@ -261,20 +249,17 @@ def growth_figure(comparison: Comparison) -> Figure | None:
         known_at = {known.stamp_ns: known.landmarks for known in run.maps}
         for panel, stamp_ns in zip(panels, stamps_ns.tolist(), strict=True):
             look = style.TRUTH_LOOK | {"linewidth": 2.6}
-            _draw_until(panel, stamp_ns, truth, label="truth", **look)
+            draw_path(panel, truth, stamp_ns, label="truth", **look)
             look = {"color": own, "linewidth": 1.0}
-            _draw_until(panel, stamp_ns, run.causal, label="causal estimate", **look)
+            draw_path(panel, run.causal, stamp_ns, label="causal estimate", **look)
             if true is not None:
-                x_y = true.positions.T[:2]
-                panel.plot(*x_y, "+", label="true landmarks", **marks)
+                draw_points(panel, true, "+", label="true landmarks", **marks)
             if stamp_ns in known_at:
-                x_y = known_at[stamp_ns].positions.T[:2]
+                known = known_at[stamp_ns]
                 look = {"color": own, "markersize": 2.5}
-                panel.plot(*x_y, "o", label="estimated landmarks", **look)
-                for ellipse in ellipses(known_at[stamp_ns], own, enlarged):
-                    panel.add_patch(ellipse)
-            panel.set(xlim=view[:, 0], ylim=view[:, 1])
-            panel.set_aspect("equal", adjustable="box")
+                draw_points(panel, known, "o", label="estimated landmarks", **look)
+                draw_ellipses(panel, known, own, enlarged)
+            frame(panel, view)
     seconds = style.seconds_since_start(comparison, stamps_ns)
     for top, bottom, at_s in zip(axes[0], axes[-1], seconds, strict=True):
         style.head_panel(top, f"T = {at_s:.1f} s")
@@ -309,7 +294,7 @@ def enlargement(comparison: Comparison) -> int:
     if view is None or not variances:
         return 1
     # relative to the view: what can be seen depends on the size of the picture
-    room_m = LARGEST_ELLIPSE * float(np.ptp(view, axis=0).max())
+    room_m = LARGEST_ELLIPSE * size_of(view)
     radius = chi_square_quantile(ELLIPSE_PROBABILITY, 2)
     half_m = math.sqrt(max(variances) * radius)
     return max((factor for factor in ENLARGED if factor * half_m <= room_m), default=1)
@@ -322,12 +307,3 @@ def _runs_with_maps(comparison: Comparison) -> dict[int, RunResult]:
         for index, run in enumerate(comparison.runs)
         if any(len(known.landmarks) for known in run.maps)
     }
-
-
-def _draw_until(
-    panel: Axes, stamp_ns: int, path: Trajectory | None, **look: Any
-) -> None:
-    """The path until an instant."""
-    if path is not None and (path.stamps_ns <= stamp_ns).any():
-        until = path.rows(np.flatnonzero(path.stamps_ns <= stamp_ns))
-        panel.plot(*horizontal(until), **look)

@@ -9,6 +9,7 @@ import numpy as np
 from sonar_graph.recognition import SEE_TRACKS, Recognition, TrackStories, TrackStory
 from sonar_graph.report.rendering import PageSection, write_html
 from sonar_graph.sonar import REPORTED
+from sonar_graph.states import counted
 
 # tracks with a picture; of more those with the most frames
 MOST_TRACKS = 400
@@ -31,16 +32,16 @@ def write_track_page(
     start_ns: int,
 ) -> None:
     """Write the page, one file with all pictures in it; ``identities`` are names of the designs in their order."""
-    longest = sorted(stories.tracks.values(), key=lambda story: -story.frames)[
-        :MOST_TRACKS
-    ]
+    longest = sorted(stories.tracks.values(), key=lambda story: -story.frames)
     shown = sorted(
-        longest, key=lambda story: (REPORTED not in story.outcomes, story.first_ns)
+        longest[:MOST_TRACKS],
+        key=lambda story: (REPORTED not in story.outcomes, story.first_ns),
     )
+    tracks = counted(len(stories.tracks), "track")
     content: dict[str, Any] = {
         "name": name,
-        "extent": f"{_number_of(recognition.frames, 'frame')}, {_number_of(len(stories.tracks), 'track')}",
-        "names": [_number_of(len(stories.tracks), "track")],
+        "extent": f"{counted(recognition.frames, 'frame')}, {tracks}",
+        "names": [tracks],
         "recognition": recognition,
         "tracks": [_row(story, [*identities, NONE], start_ns) for story in shown],
         "left_out": len(stories.tracks) - len(shown),
@@ -51,11 +52,6 @@ def write_track_page(
     write_html(path, "recognition", SECTIONS, content)
 
 
-def _number_of(count: int, what: str) -> str:
-    """Such as "1 frame" and "2 frames"."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
-
-
 def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, Any]:
     """Values of one track, by the names that the template uses."""
     order = np.argsort(-story.beliefs).tolist()
@@ -64,7 +60,7 @@ def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, An
         "jpeg": story.jpeg,
         "from_s": (story.first_ns - start_ns) * 1e-9,
         "to_s": (story.last_ns - start_ns) * 1e-9,
-        "frames": _number_of(story.frames, "frame"),
+        "frames": counted(story.frames, "frame"),
         "beliefs": [
             (names[k], float(story.beliefs[k]))
             for k in order
