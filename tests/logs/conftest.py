@@ -153,12 +153,12 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
-def decode(path: Path) -> dict[str, list[Any]]:
-    """Messages of a log by topic, as mcap-ros2-support reads them."""
+def decode(path: Path, *topics: str) -> dict[str, list[Any]]:
+    """Messages of a log, or of some topics, by topic, as mcap-ros2-support reads them."""
     found: dict[str, list[Any]] = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages():
+        for _, channel, _, message in reader.iter_decoded_messages(topics or None):
             found.setdefault(channel.topic, []).append(message)
     return found
 

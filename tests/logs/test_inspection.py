@@ -26,7 +26,7 @@ from sonar_graph.logs.mcap import Keep, scan
 from sonar_graph.logs.roles import choose_topic, refusal
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
-from .conftest import Bench, channel_for, chunk_indexes, flip, writing
+from .conftest import Bench, channel_for, writing
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
@@ -68,20 +68,6 @@ def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
     said = inspect_log(path, config)
     assert role(said, "imu") == ("/imu", "chosen in my.toml")
     assert role(said, "dvl") == (None, "switched off in my.toml")
-
-
-def test_damage_is_reported_instead_of_raised(
-    make_sequence: Any, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.mcap"
-    write_log(path, make_sequence(samples=20_000))
-    content = path.read_bytes()
-    chunk = chunk_indexes(path)[0]
-    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
-    assert "chunk" in inspect_log(path).damage[0]
-    path.write_bytes(content[: len(content) // 2])
-    (ending,) = inspect_log(path).damage
-    assert "cut off" in ending
 
 
 @pytest.mark.recording

@@ -73,40 +73,46 @@ def test_reading_what_was_written_is_the_identity(
     assert found.notes.items() >= sequence.notes.items()
 
 
+def xyz(vector):
+    return [vector.x, vector.y, vector.z]
+
+
 def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
     sequence = make_sequence()
     write_log(tmp_path / "a.mcap", sequence)
     messages = decode(tmp_path / "a.mcap")
-    assert set(messages) == {"/imu/data", "/dvl/data", "/depth/pose", "/sonar/landmarks", "/tf_static",
-                             "/ground_truth/odometry", "/ground_truth/landmarks", "/heading",
-                             "/fixes/pose"}  # fmt: skip
-    imu = messages["/imu/data"]
-    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in imu]
-    assert stamps == sequence.imu.stamps_ns.tolist()
-    rates = [
-        [m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in imu
-    ]
-    assert rates == sequence.imu.angular_velocity.tolist()
-    assert [m.linear_acceleration_covariance[0] for m in imu] == [
-        -1.0 if i % 4 == 0 else 0.0 for i in range(20)
-    ]
-    assert [m.velocity_mode for m in messages["/dvl/data"]] == [1] * 20
-    assert [
-        m.pose.pose.position.z for m in messages["/depth/pose"]
-    ] == sequence.depth.z_m.tolist()
-    assert [
-        m.yaw_rad for m in messages["/heading"]
-    ] == sequence.heading.yaw_rad.tolist()
-    assert [
-        m.pose.pose.position.y for m in messages["/fixes/pose"]
-    ] == sequence.positions.position_m[:, 1].tolist()
-    ranges = [r for m in messages["/sonar/landmarks"] for r in m.range_m]
+    stamps = [m.header.stamp for m in messages["/imu/data"]]
+    nanoseconds = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
+    assert nanoseconds == sequence.imu.stamps_ns.tolist()
+    unmeasured = np.isnan(sequence.imu.specific_force).all(axis=1)
+    columns = {
+        "/imu/data": (
+            lambda m: [*xyz(m.angular_velocity), m.linear_acceleration_covariance[0]],
+            np.column_stack(
+                [sequence.imu.angular_velocity, np.where(unmeasured, -1, 0)]
+            ),
+        ),
+        "/dvl/data": (lambda m: m.velocity_mode, np.ones(20)),
+        "/depth/pose": (lambda m: m.pose.pose.position.z, sequence.depth.z_m),
+        "/heading": (lambda m: m.yaw_rad, sequence.heading.yaw_rad),
+        "/fixes/pose": (
+            lambda m: xyz(m.pose.pose.position),
+            sequence.positions.position_m,
+        ),
+        "/ground_truth/odometry": (
+            lambda m: xyz(m.pose.pose.position),
+            sequence.truth.positions,
+        ),
+        "/ground_truth/landmarks": (lambda m: m.ids, [[3, 7]]),
+    }
+    for topic, (column, expected) in columns.items():
+        np.testing.assert_array_equal([*map(column, messages.pop(topic))], expected)
+    ranges = [r for m in messages.pop("/sonar/landmarks") for r in m.range_m]
     assert ranges == sequence.detections.range_m.tolist()
-    assert list(messages["/ground_truth/landmarks"][0].ids) == [3, 7]
-    (tree,) = messages["/tf_static"]
-    frames = {t.child_frame_id for t in tree.transforms}
-    assert frames == {"imu", "dvl", "depth", "sonar", "positions"}
-    assert tree.transforms[0].transform.translation.y == 0.2
+    ((tree,),) = messages.values()
+    frames = {t.child_frame_id: t.transform for t in tree.transforms}
+    assert frames.keys() == {"imu", "dvl", "depth", "sonar", "positions"}
+    assert frames["imu"].translation.y == 0.2
 
 
 def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
@@ -129,27 +135,19 @@ def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
 # --- sonar images ----------------------------------------------------------------------------------------------------
 
 
-def frames(
-    kind: str = "u1", count: int = 3, first: int = 0, beams: int = 4, bins: int = 5
-) -> SonarFrames:
-    intensity = np.arange(count * beams * bins).reshape(count, beams, bins) % 97 + first
-    stamps_ns = 1_700_000_000_000_000_123 + (first + np.arange(count)) * 10**8
-    azimuths_rad = np.radians(np.linspace(14.0, -15.0, beams))
-    return SonarFrames(
-        stamps_ns, intensity.astype(kind), np.linspace(1.26, 2.51, bins), azimuths_rad
-    )
+def frames(kind: str = "u1", count: int = 3) -> SonarFrames:
+    intensity = np.arange(count * 20).reshape(count, 4, 5)
+    stamps_ns = T0_NS + 123 + np.arange(count) * 10**8
+    azimuths_rad = np.radians(np.linspace(14.0, -15.0, 4))
+    ranges_m = np.linspace(1.26, 2.51, 5)
+    return SonarFrames(stamps_ns, intensity.astype(kind), ranges_m, azimuths_rad)
 
 
 def write_frames(path: Path, *blocks: SonarFrames) -> Path:
+    sonar = {"frequency_hz": 1.8e6, "sound_speed_m_s": 1480}
     with recording(path, {}) as out:
         for block in blocks:
-            out.write(
-                [
-                    sonar_image_messages(
-                        "/sonar/image", block, frequency_hz=1.8e6, sound_speed_m_s=1480
-                    )
-                ]
-            )
+            out.write([sonar_image_messages("/sonar/image", block, **sonar)])
     return path
 
 
@@ -158,17 +156,12 @@ def test_another_library_sees_what_the_message_defines(tmp_path):
     (messages,) = decode(write_frames(tmp_path / "log.mcap", written)).values()
     assert [m.header.stamp.nanosec for m in messages] == [123, 100_000_123, 200_000_123]
     first = messages[0]
-    assert (first.ping_info.frequency, first.ping_info.sound_speed) == (
-        np.float32(1.8e6),
-        1480,
-    )
-    assert (first.image.dtype, first.image.beam_count, first.image.is_bigendian) == (
-        0,
-        4,
-        False,
-    )
+    sonar = (first.ping_info.frequency, first.ping_info.sound_speed)
+    assert sonar == (np.float32(1.8e6), 1480)
+    image = first.image
+    assert (image.dtype, image.beam_count, image.is_bigendian) == (0, 4, False)
     # all beams of the first range first
-    assert bytes(first.image.data) == written.intensity[0].T.tobytes()
+    assert bytes(image.data) == written.intensity[0].T.tobytes()
     left = first.beam_directions[0]
     right = first.beam_directions[-1]
     assert (left.x, right.x) == (0, 0)
@@ -178,31 +171,21 @@ def test_another_library_sees_what_the_message_defines(tmp_path):
 
 def test_messages_made_one_by_one_lie_in_the_order_of_time(make_sequence, tmp_path):
     sequence = make_sequence()
-    blocks = [
-        replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1])
-        for row in (4, 12)
-    ]
     write_log(tmp_path / "a.mcap", sequence)
-    write_log(
-        tmp_path / "b.mcap",
-        sequence,
-        (sonar_image_messages("/sonar/image", block) for block in blocks),
+    stamps_ns = sequence.imu.stamps_ns[[4, 12]]
+    images = (
+        sonar_image_messages("/sonar/image", replace(frames(count=1), stamps_ns=at_ns))
+        for at_ns in np.split(stamps_ns, 2)
     )
-    times: list[list[int]] = []
+    write_log(tmp_path / "b.mcap", sequence, images)
+    times = []
     for name in ("a.mcap", "b.mcap"):
         with (tmp_path / name).open("rb") as stream:
-            times.append(
-                [
-                    r.log_time
-                    for r in StreamReader(stream).records
-                    if isinstance(r, Message)
-                ]
-            )
+            records = StreamReader(stream).records
+            times.append([r.log_time for r in records if isinstance(r, Message)])
     assert len(times[0]) > 80
     assert times[0] == sorted(times[0])
-    assert times[1] == sorted(
-        [*times[0], *(int(block.stamps_ns[0]) for block in blocks)]
-    )
+    assert times[1] == sorted([*times[0], *stamps_ns.tolist()])
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -231,28 +214,18 @@ def test_a_recording_has_the_records_of_rosbag2(
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        assert (
-            summary.statistics.message_count
-            == sum(1 for _ in reader.iter_messages())
-            == 20_001
-        )
-        assert len(summary.chunk_indexes) > 3
-        assert all(
-            index.message_index_length > 0 and index.compression
-            for index in summary.chunk_indexes
-        )
+        count = sum(1 for _ in reader.iter_messages())
+        assert summary.statistics.message_count == count == 20_001
+        indexes = summary.chunk_indexes
+        assert len(indexes) > 3
+        assert all(one.message_index_length and one.compression for one in indexes)
         assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
         assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
         about = {m.name: m.metadata for m in reader.iter_metadata()}["about"]
         assert open_seal(about) == ({"key": "value ψ"}, True)
         (file,) = reader.iter_attachments()
-    assert (file.name, file.media_type, file.data) == (
-        "notes/a.json",
-        "application/json",
-        b'{"a": 1}',
-    )
+    found = (file.name, file.media_type, file.data)
+    assert found == ("notes/a.json", "application/json", b'{"a": 1}')
 
 
 def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> None:
@@ -284,13 +257,11 @@ def test_latched_topics_offer_transient_local_qos(
     assert offered["/pose"] == []
     with long_log.open("rb") as stream:
         reader = make_reader(stream)
-        (channel,) = [
-            c for c in reader.get_summary().channels.values() if c.topic == "/start"
-        ]  # type: ignore[union-attr]
-        assert "durability: 1," in channel.metadata["offered_qos_profiles"]
-        assert {m.name: m.metadata for m in reader.iter_metadata()}["rosbag2"] == {
-            "serialized_metadata": ""
-        }
+        channels = reader.get_summary().channels.values()
+        metadata = {c.topic: c.metadata for c in channels}
+        assert "durability: 1," in metadata["/start"]["offered_qos_profiles"]
+        records = {m.name: m.metadata for m in reader.iter_metadata()}
+        assert records["rosbag2"] == {"serialized_metadata": ""}
 
 
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
