@@ -1,6 +1,7 @@
 """Logs and MCAP files written by other libraries than ours, to be read and damaged, and a small sequence."""
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -8,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
+from mcap.records import Channel, ChunkIndex, Message, Schema
 from mcap.writer import Writer as ContainerWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
@@ -270,6 +271,37 @@ def write(
             writer.add_message(channel, time_ns, payload, time_ns)
             writer.add_message(silent, time_ns, b'{"a": 1}', time_ns)
     return written
+
+
+Change = Callable[[str, int, bytes], bytes | None]
+"""Payload in a copy, of a message by topic, number and payload; None: it is left out."""
+
+
+def recorded(path: Path) -> list[tuple[Schema | None, Channel, Message]]:
+    with path.open("rb") as stream:
+        return list(make_reader(stream).iter_messages())
+
+
+def copy(
+    messages: Iterable[tuple[Schema | None, Channel, Message]],
+    writer: ContainerWriter,
+    change: Change = lambda *message: message[-1],
+) -> None:
+    """Write messages of a log into another file, without its metadata."""
+    seen = Counter[str]()
+    channels: dict[str, int] = {}
+    for schema, channel, message in messages:
+        topic = channel.topic
+        data = change(topic, seen[topic], message.data)
+        seen[topic] += 1
+        if topic not in channels and schema is not None:
+            kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[topic] = writer.register_channel(
+                topic, channel.message_encoding, kind, channel.metadata
+            )
+        if data is not None:
+            times = (message.publish_time, message.sequence)
+            writer.add_message(channels[topic], message.log_time, data, *times)
 
 
 def write_apart(path: Path, count: int = 100) -> None:

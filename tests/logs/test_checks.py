@@ -31,8 +31,8 @@ from sonar_graph.logs.checks import (
     two_sensors,
     unlikely_zeros,
 )
-from sonar_graph.logs.reading import require_use, unsaid_noise
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.logs.reading import require_use
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu
 
 PINGS = np.arange(1500) * 0.2
 SAMPLES = np.arange(30000) * 0.01
@@ -335,42 +335,15 @@ def test_frames_that_repeat_while_the_vehicle_moves_are_stuck() -> None:
 # --- enough for an estimator ----------------------------------------------------------------------------------------
 
 
-def test_measurements_with_which_no_estimator_could_begin_are_refused() -> None:
+def test_one_common_instant_is_enough_and_one_whole_velocity() -> None:
     five = np.arange(5.0)
-    require_use("log.mcap", imu(five), dvl(five + 4))  # one common instant is enough
+    require_use("log.mcap", imu(five), dvl(five + 4))
     require_use("log.mcap", imu(five), dvl(five, five != 3))
     spans = r"log\.mcap: IMU from 1000\.000 to 1004\.000 s, DVL from 4600\.000 to 4604\.000 s: no common time"
     with pytest.raises(LogError, match=spans):
         require_use("log.mcap", imu(five), dvl(five + 3600))
-    with pytest.raises(
-        LogError,
-        match=r"log\.mcap: DVL: none of its 5 rows measures a velocity in all directions",
-    ):
+    with pytest.raises(LogError, match=r"none of its 5 rows measures a velocity in"):
         require_use("log.mcap", imu(five), dvl(five, True))
-
-
-def test_rows_that_do_not_say_their_noise_are_counted() -> None:
-    five = np.arange(5.0)
-    doppler = dvl(five)
-    depth = Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
-    known = np.tile(np.eye(2), (5, 1, 1))
-    ones = np.ones((5, 1))
-    detections = LandmarkDetections(
-        stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones
-    )
-    blocks = {"dvl": doppler, "depth": depth, "heading": None, "detections": detections}
-    assert list(unsaid_noise(blocks)) == []
-    doppler.velocity_cov[1:3, 2, 2] = depth.variance_m2[
-        0
-    ] = detections.range_azimuth_cov[:] = np.nan
-    assert list(unsaid_noise(blocks)) == [
-        "dvl: 2 of 5 rows say no covariance, dvl.velocity_sigma_m_s of the calibration count",
-        "depth: 1 of 5 rows say no covariance, depth.sigma_m of the calibration count",
-        "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",
-    ]
-    assert [
-        text.partition(":")[0] for text in unsaid_noise(blocks, only_partly=True)
-    ] == ["dvl", "depth"]
 
 
 def rates(seed: int, clip: float = np.inf, dead: int | None = None, step: float = 0.0):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import zstandard
 
-from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
@@ -21,9 +20,7 @@ from sonar_graph.logs import PartialCalibration, inspect_log, read_log
 from sonar_graph.logs.cdr import parse_definition
 from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
-from sonar_graph.logs.roles import TF
-from sonar_graph.logs.vehicle_setup import encode_mountings
-from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
+from sonar_graph.logs.writing import imu_messages
 
 LIMIT = 1 << 16
 PACK: dict[str, Callable[[bytes], bytes]] = {
@@ -120,47 +117,33 @@ TRANSLATION = "numbers that are not finite"
 
 
 @pytest.mark.parametrize(
-    ("of", "value", "message"),
+    ("changed", "message"),
     [
-        ("rotation", np.nan, TRANSLATION),
-        ("rotation", np.inf, TRANSLATION),
-        ("rotation", 0.0, ROTATION + "0"),
-        ("translation", 1e300, r"dvl: is .* m from base_link"),
-        ("translation", 350.0, r"dvl: is .* m from base_link: millimetres"),
+        ({"rotation": {"w": np.nan}}, TRANSLATION),
+        ({"rotation": {"w": np.inf}}, TRANSLATION),
+        ({"rotation": {"w": 0.0}}, ROTATION + "0"),
+        ({"translation": {"x": 1e300}}, r"dvl_link: is .* m from base_link"),
+        (
+            {"translation": {"x": 350.0}},
+            r"dvl_link: is .* m from base_link: millimetres",
+        ),
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
-    make_sequence: Any, tmp_path: Path, of: str, value: float, message: str
+    bench: Any, changed: dict[str, Any], message: str
 ) -> None:
-    sequence = make_sequence()
-    path = tmp_path / "log.mcap"
-    payload = bytearray(encode_mountings(Calibration())[0].tobytes())
-    ends = [
-        at
-        for at in range(4, len(payload) - 8, 4)
-        if struct.unpack_from("<d", payload, at)[0] == 1.0 and at % 8 == 4
-    ]
-    # of the second transform, the Doppler log's: x, y, z, then the quaternion's x, y, z, w
-    w = ends[1]
-    for at in (w - 24, w - 16, w - 8, w) if of == "rotation" else (w - 48,):
-        struct.pack_into("<d", payload, at, value)
-    tree = static_message(
-        "/tf_static", TF, 0, np.frombuffer(bytes(payload), np.uint8)[None]
-    )
-    write_recording(
-        path,
-        [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)],
-        {},
-    )
-    with pytest.raises(
-        LogError, match=rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"
-    ):
+    transform = bench.transform("base_link", "dvl_link", (0, 0, 0))
+    for part, numbers in changed.items():
+        transform["transform"][part] |= numbers
+    tree = ("/tf_static", "tf", [{"transforms": [transform]}])
+    path = bench.write(*bench.basics(), tree)
+    pattern = rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"
+    with pytest.raises(LogError, match=pattern):
         read_log(path)
     assert any("--calibration" in text for text in inspect_log(path).unusable)
     stated = PartialCalibration.parse({"dvl": {"mounting": {}}}, "vehicle.toml")
-    assert read_log(
-        path, calibration=stated
-    ).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
+    calibration = read_log(path, calibration=stated).calibration
+    assert calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
 
 
 SLOW: dict[str, str] = {

@@ -1,6 +1,5 @@
 """Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
 
-from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,13 @@ from sonar_graph.logs import (
     read_log,
     sonar_image_messages,
 )
-from sonar_graph.logs.mcap import write_recording
+from sonar_graph.logs.mcap import Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import encode_mountings, gathered, mounting_of
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 
 TREE_M = (1.0, 2.0, 3.0)
+T0_NS = 1_700_000_000_000_000_000
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
 
 
@@ -43,9 +43,11 @@ def written(
     sequence: Any,
     tree: Calibration | None,
     record: dict[str, str] | None = None,
+    *more: Outgoing,
 ) -> Path:
     """A log of IMU and DVL with the mountings of a calibration and a metadata record."""
     messages = [imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)]
+    messages += more
     if tree is not None:
         messages.insert(0, static_message("/tf_static", TF, 0, encode_mountings(tree)))
     write_recording(path, messages, {METADATA: record} if record else {})
@@ -58,7 +60,7 @@ def written(
 def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
     make_sequence: Any, tmp_path: Path
 ) -> None:
-    sequence = replace(make_sequence(), detections=None)
+    sequence = make_sequence()
     mounting = Mounting(rpy_rad=(0.0, 0.5, 0.0))
     frames = SonarFrames(
         sequence.imu.stamps_ns[:2],
@@ -66,18 +68,9 @@ def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
         np.arange(1.0, 5),
         np.array([0.1, 0.0, -0.1]),
     )
-    messages = [
-        static_message(
-            "/tf_static",
-            TF,
-            0,
-            encode_mountings(Calibration(sonar=SonarCalibration(mounting=mounting))),
-        ),
-        imu_messages("/imu", sequence.imu),
-        dvl_messages("/dvl", sequence.dvl),
-        sonar_image_messages("/sonar/image", frames),
-    ]
-    write_recording(tmp_path / "a.mcap", messages, {})
+    tree = Calibration(sonar=SonarCalibration(mounting=mounting))
+    images = sonar_image_messages("/sonar/image", frames)
+    written(tmp_path / "a.mcap", sequence, tree, None, images)
     found = read_log(tmp_path / "a.mcap")
     np.testing.assert_allclose(
         found.calibration.sonar.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12
@@ -126,53 +119,20 @@ def test_a_frame_is_found_below_the_body_of_any_name(
 
 
 def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench: Any) -> None:
-    imu, dvl = bench.basics(20)
     tree = {"transforms": [bench.transform("base_link", "dvl_link", (1, 2, 3))]}
-    bench.write(imu, dvl, ("/tf_static", "tf", [tree]), name="dive_0.mcap")
-    bench.t0_ns += 2 * 10**9
-    later = (
-        [bench.dvl(bench.t0_ns + i * 10**8) for i in range(20)],
-        [bench.imu(bench.t0_ns + i * 10**8) for i in range(20)],
-    )
-    second = bench.write(
-        ("/dvl", "dvl", later[0]), ("/imu", "imu", later[1]), name="dive_1.mcap"
-    )
-    assert read_log(second).calibration.dvl.mounting.translation_m == (1, 2, 3)
-    bench.t0_ns += 3600 * 10**9
-    later = (
-        [bench.dvl(bench.t0_ns + i * 10**8) for i in range(20)],
-        [bench.imu(bench.t0_ns + i * 10**8) for i in range(20)],
-    )
-    another = bench.write(
-        ("/dvl", "dvl", later[0]), ("/imu", "imu", later[1]), name="dive_2.mcap"
-    )
-    assert read_log(another).calibration.dvl.mounting == Mounting(), (
-        "an hour later: another recording"
-    )
-
-
-def test_mountings_come_from_tf_static_through_frames_in_between(
-    bench: Any,
-) -> None:
-    first = bench.transform("base_link", "frame", (1, 0, 0), np.pi / 2)
-    second = bench.transform("frame", "imu_link", (0.5, 0, 0), np.pi / 2)
-    log = bench.write(
-        *bench.basics(),
-        ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}]),
-    )
-    sequence = read_log(log)
-    # half a metre along the frame's x, which points along the body's y
-    np.testing.assert_allclose(
-        sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12
-    )
-    np.testing.assert_allclose(
-        np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12
-    )
-    assert sequence.calibration.dvl == Calibration().dvl
-    assert (
-        "mountings from /tf_static: imu (imu_link); not in the tree"
-        in sequence.notes["log.calibration"]
-    )
+    mountings = []
+    # two seconds after the first file, and an hour later: another recording
+    for number, later_s in enumerate((0, 2, 3602)):
+        bench.t0_ns = T0_NS + later_s * 10**9
+        stamps_ns = [bench.t0_ns + i * 10**8 for i in range(20)]
+        topics = [
+            ("/dvl", "dvl", [bench.dvl(ns) for ns in stamps_ns]),
+            ("/imu", "imu", [bench.imu(ns) for ns in stamps_ns]),
+            ("/tf_static", "tf", [] if number else [tree]),
+        ]
+        path = bench.write(*topics, name=f"dive_{number}.mcap")
+        mountings.append(read_log(path).calibration.dvl.mounting.translation_m)
+    assert mountings == [TREE_M, TREE_M, (0, 0, 0)]
 
 
 # --- precedence -----------------------------------------------------------------------------------------------------

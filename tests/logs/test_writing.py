@@ -73,48 +73,6 @@ def test_reading_what_was_written_is_the_identity(
     assert found.notes.items() >= sequence.notes.items()
 
 
-def xyz(vector):
-    return [vector.x, vector.y, vector.z]
-
-
-def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path):
-    sequence = make_sequence()
-    write_log(tmp_path / "a.mcap", sequence)
-    messages = decode(tmp_path / "a.mcap")
-    stamps = [m.header.stamp for m in messages["/imu/data"]]
-    nanoseconds = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
-    assert nanoseconds == sequence.imu.stamps_ns.tolist()
-    unmeasured = np.isnan(sequence.imu.specific_force).all(axis=1)
-    columns = {
-        "/imu/data": (
-            lambda m: [*xyz(m.angular_velocity), m.linear_acceleration_covariance[0]],
-            np.column_stack(
-                [sequence.imu.angular_velocity, np.where(unmeasured, -1, 0)]
-            ),
-        ),
-        "/dvl/data": (lambda m: m.velocity_mode, np.ones(20)),
-        "/depth/pose": (lambda m: m.pose.pose.position.z, sequence.depth.z_m),
-        "/heading": (lambda m: m.yaw_rad, sequence.heading.yaw_rad),
-        "/fixes/pose": (
-            lambda m: xyz(m.pose.pose.position),
-            sequence.positions.position_m,
-        ),
-        "/ground_truth/odometry": (
-            lambda m: xyz(m.pose.pose.position),
-            sequence.truth.positions,
-        ),
-        "/ground_truth/landmarks": (lambda m: m.ids, [[3, 7]]),
-    }
-    for topic, (column, expected) in columns.items():
-        np.testing.assert_array_equal([*map(column, messages.pop(topic))], expected)
-    ranges = [r for m in messages.pop("/sonar/landmarks") for r in m.range_m]
-    assert ranges == sequence.detections.range_m.tolist()
-    ((tree,),) = messages.values()
-    frames = {t.child_frame_id: t.transform for t in tree.transforms}
-    assert frames.keys() == {"imu", "dvl", "depth", "sonar", "positions"}
-    assert frames["imu"].translation.y == 0.2
-
-
 def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
     for stamp_ns in (2**31 * 10**9, -(2**31) * 10**9 - 1):
         sequence = replace(
