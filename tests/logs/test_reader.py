@@ -192,16 +192,10 @@ ENDING = "does not end as an MCAP file"
 TWICE = r"schema 1 \(test_msgs/msg/Bytes\) is described in two ways; the first holds"
 FAULTS = {
     "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
-    "a bit in a chunk without compression": Fault(
-        in_chunk(1, 900), 1, SECOND, "", PLAIN
-    ),
     "a chunk's opcode": Fault(in_chunk(1, 0, 0x80)),
     "a chunk's size beyond all memory": Fault(huge_size, 1, SECOND),
     "both lengths of a chunk": Fault(both_lengths, None, "", "", PLAIN),
     "bytes missing": Fault(missing_in_chunk(1, 1500), 1, "no valid record", MOVED),
-    "the same without compression": Fault(
-        missing_in_chunk(1, 1500), 1, "no valid record", MOVED, PLAIN
-    ),
     "the first chunk, with the descriptions": Fault(
         in_chunk(0, 100), 0, "chunk 1 is lost"
     ),
@@ -229,8 +223,6 @@ FAULTS = {
         at_text(b"sonar_graph", -12, 64), None, "no valid record; no messages lost"
     ),
     "zeros after the end": Fault(tail(bytes(5000)), None, "", ENDING),
-    "opcodes after the end": Fault(tail(b"\x05" * 5000), None, "", ENDING),
-    "noise after the end": Fault(tail(bytes(range(256)) * 20), None, "", ENDING),
 } | {
     f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit))
     for at in (1, 2, 5, 8)
@@ -277,7 +269,7 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(
         assert loss.messages == (None if fault.remark == MOVED else counted)
         with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: .*--salvage"):
             recording.require_sound()
-    if name.startswith("a bit in a chunk"):
+    if name == "a bit in a chunk":
         assert loss.end == chunk_end(chunks[1])
         assert (loss.start_ns or 0) <= chunks[1].message_start_time
         assert chunks[1].message_end_time <= (loss.end_ns or 0)
@@ -390,16 +382,6 @@ def test_a_truncated_file_is_read_up_to_the_cut(
     written = write(path)
     chunks = chunk_indexes(path)
     content = path.read_bytes()
-    for kept in (0.3, 0.6, 0.8):
-        path.write_bytes(content[: int(len(content) * kept)])
-        found = read(path)
-        recording = scan_all(path)
-        assert 0 < len(found) < len(written)
-        assert found == written[: len(found)]
-        assert re.search(
-            r"^the file is cut off: .* spans 0\.000 s$", recording.ending or ""
-        )
-        recording.require_sound()
     path.write_bytes(content[: chunk_end(chunks[-1])])
     assert (scan_all(path).ending or "").startswith(
         "the file is cut off: it ends after a whole record"

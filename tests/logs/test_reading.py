@@ -24,7 +24,6 @@ from sonar_graph.logs.mcap import Instant, TimeWindow, writer
 from .conftest import T0_NS, Bench, chunk_indexes, flip, header
 
 STEP_NS = 10**8
-UNKNOWN = [-1.0] + [0.0] * 8
 
 
 # --- topics ---------------------------------------------------------------------------------------------------------
@@ -68,16 +67,29 @@ def test_the_chosen_topic_is_read_and_impossible_ones_are_refused(
     assert "imu: /other" in chosen.notes["log.topics"]
 
 
-def test_paths_may_be_texts(bench: Bench, tmp_path: Path) -> None:
+def test_paths_may_be_texts_and_a_window_two_times(
+    bench: Bench, tmp_path: Path
+) -> None:
     path = bench.write(*bench.basics())
     setup = tmp_path / "setup.toml"
     setup.write_text("[imu]\ngyro_bias_sigma = 0.25")
-    sequence = read_log(str(path), calibration=str(setup))
-    assert sequence.calibration.imu.gyro_bias_sigma == 0.25
-    write_log(str(tmp_path / "copy.mcap"), sequence)
-    assert inspect_log(str(tmp_path / "copy.mcap")).name == sequence.name
+    config = tmp_path / "mine.toml"
+    config.write_text('[dvl]\nrotation = "frd"')
+    for text in (str, Path):
+        sequence = read_log(
+            text(path),
+            calibration=text(setup),
+            config=text(config),
+            window=(0.1, "0.3"),
+        )
+        assert sequence.calibration.imu.gyro_bias_sigma == 0.25
+        assert sequence.notes["log.adapters"] == 'dvl: rotation = "frd"'
+        assert len(sequence.imu) == 2
+        summary = inspect_log(text(path), text(config), window=(0, None))
+        assert '\nrotation = "frd"' in summary.toml
+        write_log(text(tmp_path / "copy.mcap"), sequence)
     with pytest.raises(
-        CalibrationError, match=r"absent\.toml: cannot be read: No such file"
+        CalibrationError, match=r"absent\.toml: cannot be read: No such"
     ):
         read_log(path, calibration=tmp_path / "absent.toml")
 
@@ -100,18 +112,6 @@ def test_a_wrong_argument_is_an_error_of_this_package_with_what_mends_it(
 ) -> None:
     with pytest.raises(SonarGraphError, match=said):
         call(bench.write(*bench.basics()))
-
-
-def test_a_configuration_may_be_a_path_and_a_window_two_times(
-    bench: Bench, tmp_path: Path
-) -> None:
-    path = bench.write(*bench.basics())
-    (tmp_path / "mine.toml").write_text('[dvl]\nrotation = "frd"')
-    for config in (tmp_path / "mine.toml", str(tmp_path / "mine.toml")):
-        sequence = read_log(path, config=config, window=(0.1, "0.3"))
-        assert sequence.notes["log.adapters"] == 'dvl: rotation = "frd"'
-        assert len(sequence.imu) == 2
-        assert '\nrotation = "frd"' in inspect_log(path, config, window=(0, None)).toml
 
 
 def test_zero_noise_raises_a_doubt_where_the_log_has_none(
@@ -147,43 +147,6 @@ def test_stamps_are_the_headers_sorted_and_once(bench: Bench) -> None:
     assert unset.imu.stamps_ns.tolist() == [T0_NS + i * STEP_NS for i in range(3)], (
         "the time of recording"
     )
-
-
-ROWS: dict[str, tuple[str, dict[str, Any], str | None]] = {
-    "rate not finite": (
-        "imu",
-        {"angular_velocity": {"x": np.nan, "y": 0.0, "z": 0.0}},
-        "values that are not finite",
-    ),
-    "rate not measured": (
-        "imu",
-        {"angular_velocity_covariance": UNKNOWN},
-        "without angular rate",
-    ),
-    "force not measured": ("imu", {"linear_acceleration_covariance": UNKNOWN}, None),
-    "velocity not finite": (
-        "dvl",
-        {"velocity": {"x": np.inf, "y": 0.0, "z": 0.0}},
-        "with values that are not finite",
-    ),
-}
-
-
-@pytest.mark.parametrize(("role", "change", "account"), ROWS.values(), ids=ROWS)
-def test_rows_that_cannot_be_used_are_left_out_and_counted(
-    bench: Bench, role: str, change: dict[str, Any], account: str | None
-) -> None:
-    entries = {topic[1]: topic for topic in bench.basics()}
-    entries[role][2][2] |= change
-    sequence = read_log(bench.write(*entries.values()))
-    kept = [0, 1, 3, 4] if account else [0, 1, 2, 3, 4]
-    assert ((getattr(sequence, role).stamps_ns - T0_NS) // STEP_NS).tolist() == kept
-    assert (account is None) == ("log.dropped" not in sequence.notes)
-    assert account is None or account in sequence.notes["log.dropped"]
-    unmeasured = np.flatnonzero(
-        np.isnan(sequence.imu.specific_force).all(axis=1)
-    ).tolist()
-    assert unmeasured == ([2] if "linear_acceleration_covariance" in change else [])
 
 
 # --- detections -----------------------------------------------------------------------------------------------------

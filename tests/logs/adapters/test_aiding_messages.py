@@ -132,8 +132,6 @@ CASES: dict[str, Case] = {
     "acoustic fixes": (
         [rows_of("/usbl/pose", POSE, [{"pose": {"pose": {"position": vector(1, 2, -3)}, "covariance": [0.0] * 36}}])],
         "", {"positions.position_m": [[1, 2, -3]]}, {}),
-    "acoustic fixes in north-east-down": (
-        [points((1, 2, 3))], '[positions]\nworld = "ned"', {"positions.position_m": [[2, 1, -3]]}, {}),
     "fixes in millimetres of a map grid in north-east-down": (
         [points((4.67e9, 5e8, 3000.0))], '[positions]\nworld = "ned"\nscale = 1e-3\norigin_m = [4.67e6, 499990.0, 1.0]',
         {"positions.position_m": [[10, 0, -2]]}, {}),
@@ -327,10 +325,6 @@ def test_an_unknown_start_is_that_of_the_first_headings_and_fixes(
         "heading and position by the first headings and fixes: position_m = ["
         in sequence.notes["log.start"]
     )
-    calibration.write_text(f"{ANTENNA}[start]\nrpy_rad = [0, 0, 1]")
-    stated = foreign.read(*aided(), calibration=calibration)
-    assert stated.calibration.start.rpy_rad == (0, 0, 1)
-    assert stated.notes["log.start"].startswith("of the start only rpy_rad stated")
 
 
 def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not() -> None:

@@ -97,22 +97,10 @@ WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
         report(lost={"velocity": vector(-32.768, -32.768, -32.768)}),
         "20 with one value beyond 30 m/s in all components",
     ),
-    "Gazebo's bridge, no beam locked": (
-        report(
-            sent={"beam_velocities_valid": True, "sound_speed": -1.0, "velocity_covar": [-1.0] * 9},
-            lost={"beam_velocities_valid": False, "num_good_beams": 0, "altitude": -1.0, "velocity": NO_LOCK},
-        ),
-        "20 with beam_velocities_valid not true",
-    ),
     "dvl_msgs, velocity_valid": (
         report(kind="dvl_msgs/msg/DVL", sent={"velocity_valid": True, "altitude": 3.0, "fom": 0.01},
                lost={"velocity_valid": False, "altitude": -1.0, "velocity": NO_LOCK}),
         "20 with velocity_valid not true",
-    ),
-    "dvl_msgs, a flag that is always true": (
-        report(kind="dvl_msgs/msg/DVL", sent={"velocity_valid": True, "altitude": 3.0, "fom": 0.01},
-               lost={"altitude": -1.0}),
-        "20 with altitude below 0",
     ),
     "twists, a covariance of -1 where nothing was measured": (
         twists(), "20 with a covariance that says invalid",

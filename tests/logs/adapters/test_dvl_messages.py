@@ -90,8 +90,6 @@ def twists(
 
 # --- beams ----------------------------------------------------------------------------------------------------------
 
-SINE = float(np.sin(np.radians(22.5)))
-
 
 def janus(tilt_deg: float, *azimuth_deg: float) -> np.ndarray:
     """Beam directions by turning the vertical: first outwards, then about itself."""
@@ -100,12 +98,6 @@ def janus(tilt_deg: float, *azimuth_deg: float) -> np.ndarray:
         for azimuth in azimuth_deg
     ]
     return np.array([turn.apply([0, 0, 1]) for turn in turns])
-
-
-def directed(across: float, down: float, **fields: Any) -> Entry:
-    """Messages with the unit vectors of four beams."""
-    units = [vector(x, y, down) for x in (-across, across) for y in (-across, across)]
-    return dvl(sound_speed=1480.0, beam_unit_vec=units, **fields)
 
 
 def packets(velocities: Any, first: float = 0.0, step: float = 0.0) -> Entry:
@@ -124,7 +116,6 @@ OF_BEAMS = TABLE + f'beams = {{velocity = "velocity", {GEOMETRY}}}\nstamp = "log
 PAIR = janus(30, 45, -45, -135, 135) @ VELOCITY
 MICROSECONDS = '"timestamp"\nstamp_unit_s = 1e-6\nstamp_offset_s = 3e8'
 FRD = '[dvl]\nrotation = "frd"\n'
-OURS = [(1, -2, -3)] * 5
 WATER_LINKED_BEAMS = """[dvl]
 valid_where = {}
 [dvl.beams]
@@ -154,7 +145,6 @@ CASES: dict[str, Case] = {
     "twist by its name": (
         [twists("/dvl/twist")], "",
         {"dvl.velocity": [VELOCITY] * 3, "dvl.velocity_cov": [np.diag([1.0, 2, 3])] * 3}, {}),
-    "twist that is chosen": ([twists("/wheels")], '[dvl]\ntopic = "/wheels"', {"dvl.velocity": [VELOCITY] * 3}, {}),
     "twist beside a Doppler log": ([dvl(4), twists("/dvl/twist")], "", {"dvl.stamps_ns": ROWS[:4]}, {}),
     "twist of odometry, in the frame of its child": (
         [twists("/odom", "nav_msgs/msg/Odometry", child_frame_id="child"), tree("child", (0.5, 0, 0), z=1.0)],
@@ -167,7 +157,6 @@ CASES: dict[str, Case] = {
     "millimetres": (
         [dvl(velocity=vector(1e3, 2e3, 3e3), velocity_covar=(np.array(KNOWN) * 1e6).tolist())], "[dvl]\nscale = 0.001",
         {"dvl.velocity": [VELOCITY] * 5, "dvl.velocity_cov": [COV] * 5}, {}),
-    "variances": ([dvl(velocity_covar=DEVIATIONS.ravel().tolist())], "", {"dvl.velocity_cov": [DEVIATIONS] * 5}, {}),
     "deviations": (
         [dvl(velocity_covar=DEVIATIONS.ravel().tolist())], '[dvl]\ncovariance = {meaning = "standard deviation"}',
         {"dvl.velocity_cov": [DEVIATIONS**2] * 5}, {}),
@@ -202,14 +191,8 @@ CASES: dict[str, Case] = {
     "beams that a driver calls invalid": (
         [water_linked(*[{"beams": [beam(i) | {"valid": i >= bad} for i in range(4)]} for bad in (0, 1, 2, 4)])],
         WATER_LINKED_BEAMS, {"dvl.stamps_ns": ROWS[:2]}, {"log.dropped": "dvl: 2 with fewer than 3 valid beams"}),
-    # directions and ranges of beams that are wrong change nothing, and nothing is warned of
     "z down": ([dvl()], "", {}, {"log.warnings": "marine_acoustic_msgs/msg/Dvl has z downwards"}),
     "z down, mounted": ([dvl(), tree("sensor", x=1.0)], "", {}, {"log.warnings": None}),
-    "directions of beams with a sine for a cosine": (
-        [directed(0.6533, SINE)], FRD, {"dvl.velocity": OURS}, {"log.warnings": None}),
-    "a range of zero": (
-        [dvl(beam_ranges_valid=True, range=[2.0, 0.0, 2.0, 2.0])], FRD, {"dvl.velocity": OURS},
-        {"log.warnings": None}),
 }
 # fmt: on
 

@@ -56,6 +56,9 @@ NO_FORCE = (
     "accelerometer measures: taken as not measured"
 )
 DIGITS = "9" * 30
+UNMEASURED = [-1.0] + [0.0] * 8
+UNMEASURED_RATE = {"angular_velocity_covariance": UNMEASURED}
+UNMEASURED_FORCE = {"linear_acceleration_covariance": UNMEASURED}
 
 
 def detection(
@@ -116,6 +119,15 @@ CASES: dict[str, Case] = {
     "force of zero once": (
         [imu(rows=2, at_1={"linear_acceleration": vector(0, 0, 0)}), dvl()], "",
         {"imu.specific_force": [[0, 0, 9.8], [0, 0, 0]]}, {}),
+    "a row without a rate, and one without a force": (
+        [imu(at_1=UNMEASURED_RATE, at_2=UNMEASURED_FORCE), dvl()], "",
+        {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 2, 3, 4]),
+         "imu.specific_force": [[0, 0, 9.8], [NAN] * 3, *[[0, 0, 9.8]] * 2]},
+        {"log.dropped": "imu: 1 without angular rate"}),
+    "a rate that is no number": (
+        [imu(at_2={"angular_velocity": vector(NAN, 0, 0)}), dvl()], "",
+        {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 1, 3, 4])},
+        {"log.dropped": "imu: 1 with values that are not finite"}),
     "wild rate": (
         [imu(300, at_150={"angular_velocity": vector(0, 0, 30)}), dvl(300)], "", {},
         {"log.warnings": "imu: 1 angular rate stands out from both neighbours, by 30 rad/s"}),
@@ -143,15 +155,12 @@ CASES: dict[str, Case] = {
         [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
         {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3}, {"log.depth": None}),
     # reference poses
-    "truth by its name": (
-        [poses(TURN)], "", {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3}, {}),
     **{f"odometry {chosen or 'by its name'}": (
         [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
         chosen, {"truth.positions": [(1, 2, 3)] * 3}, {"log.truth": None})
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
     "odometry of another name": (
         [poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry")], "", {}, {"log.truth": "/odom only if chosen"}),
-    "pose of another name": ([poses(TURN, topic="/pose")], "", {}, {"log.truth": "/pose only if chosen"}),
     # landmarks
     "positions as range and azimuth, results as the posterior": (
         [arrays(*FRAMES)], "",
