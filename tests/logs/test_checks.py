@@ -280,35 +280,30 @@ def test_equal_rows_of_more_than_a_second_and_five_rows_are_named(
 EVERY_TENTH_S = stamps(np.arange(300) / 10)
 
 
+STOPPED = moving((slice(100, 200), 0.3))
+
+
 @pytest.mark.parametrize(
     ("quantity", "values", "others", "is_stuck"),
     [
-        ("angular rate", moving((slice(100, 200), 0.3)), moving(), True),
+        ("angular rate", STOPPED, moving(), True),
         ("angular rate", moving((slice(100, 200), 0.0)), moving(), True),
-        ("velocity", moving((slice(100, 200), 0.3)), moving(), True),
+        ("velocity", STOPPED, moving(), True),
         ("velocity", moving((slice(100, 200), 0.0)), moving(), False),  # at rest
-        ("velocity", moving((slice(100, 200), 0.3)), moving((slice(120, 160), 0.1)), False),  # a simulator at rest
+        ("velocity", STOPPED, moving((slice(120, 160), 0.1)), False),  # a simulator at rest
         ("velocity", moving((slice(100, 120), 0.3)), moving(), False),  # 2 s
-        ("velocity", moving(), moving(), False),
     ],
 )  # fmt: skip
 def test_a_quantity_that_repeats_while_others_change_is_stuck(
     quantity: str, values: Floats, others: Floats, is_stuck: bool
 ) -> None:
-    others_by_name = {"force": (EVERY_TENTH_S, others)}
-    stuck = stuck_rows(
-        EVERY_TENTH_S, values, others_by_name, may_rest=quantity == "velocity"
-    )
-    np.testing.assert_array_equal(
-        np.flatnonzero(stuck), np.arange(100, 200) if is_stuck else []
-    )
+    rows = {quantity: (EVERY_TENTH_S, values), "force": (EVERY_TENTH_S, others)}
+    stuck = stuck_rows(quantity, rows)
+    at = np.arange(100, 200) if is_stuck else []
+    np.testing.assert_array_equal(np.flatnonzero(stuck), at)
+    said = f"{quantity} the same to the last bit in 100 rows, 10.000 to 19.900 s"
     found = stuck_doubt(EVERY_TENTH_S, stuck, quantity)
-    assert (found is not None) == is_stuck
-    if is_stuck:
-        assert (
-            f"{quantity} the same to the last bit in 100 rows, 10.000 to 19.900 s"
-            in str(found)
-        )
+    assert (found or "").startswith(said) == is_stuck == bool(found)
 
 
 def test_frames_that_repeat_while_the_vehicle_moves_are_stuck() -> None:
@@ -357,41 +352,35 @@ def rates(seed: int, clip: float = np.inf, dead: int | None = None, step: float 
     return np.round(rate / step) * step if step else rate
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_an_axis_that_is_dead_or_clipped_is_named_and_no_other(seed):
-    (dead,) = dead_axes(rates(seed, dead=2), "angular rate")
-    assert dead.startswith("angular rate along z is 0 in every row")
-    low, high = clipped_axes(rates(seed, clip=0.2), "angular rate")
-    assert low.startswith("angular rate along z is never beyond -0.2")
-    assert high.startswith("angular rate along z is never beyond 0.2")
+RATE = "angular rate"
+FAULTY: dict[str, tuple[Any, Any, list[str]]] = {
+    "dead": (dead_axes, lambda seed: rates(seed, dead=2), ["angular rate along z is 0 in every row"]),
+    "clipped": (clipped_axes, lambda seed: rates(seed, clip=0.2),
+                [f"angular rate along z is never beyond {limit}" for limit in (-0.2, 0.2)]),
+    "two sensors": (two_sensors, lambda seed: alternating(rates(seed)), ["angular rate along y changes by"]),
+    "magnitudes": (magnitudes, lambda seed: np.abs(rates(seed)), ["angular rate is never negative"]),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_two_sensors_that_take_turns_on_a_topic_are_named(seed):
-    values = rates(seed)
-    noisy = values + 0.1 * np.random.default_rng(seed).standard_normal(values.shape)
-    assert not list(two_sensors(values, "angular rate", "imu"))
-    assert not list(two_sensors(noisy, "angular rate", "imu"))
+def alternating(values: Floats) -> Floats:
+    """Rows of a sensor and of another with other axes, by turns."""
     turned = values[:, [1, 0, 2]] * [1.0, -1.0, 1.0]
-    both = np.where(np.arange(len(values))[:, None] % 2, values, turned)
-    (text,) = two_sensors(both, "angular rate", "imu")
-    assert "two sensors take turns on one topic" in text
+    return np.where(np.arange(len(values))[:, None] % 2, values, turned)
 
 
+@pytest.mark.parametrize("fault", FAULTY)
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("step", [0.0, 1e-3, 0.05])
-def test_no_axis_of_a_whole_sensor_is_named_however_coarse_it_is(seed, step):
-    whole = rates(seed, step=step)
-    for check in (dead_axes, clipped_axes):
-        assert not list(check(whole, "angular rate"))
-    assert not list(magnitudes(whole))
-
-
-def test_magnitudes_without_a_sign_raise_a_doubt():
-    velocity = rates(1)
-    assert len(list(magnitudes(np.abs(velocity)))) == 1
-    velocity[:, 0] = np.abs(velocity[:, 0]) + 1.0
-    assert not list(magnitudes(velocity))
+def test_a_faulty_axis_is_named_and_none_of_a_whole_sensor(fault: str, seed: int):
+    check, values, expected = FAULTY[fault]
+    found = list(check(values(seed), RATE))
+    assert len(found) == len(expected)
+    assert all(map(str.startswith, found, expected))
+    ahead = rates(seed)
+    ahead[:, 0] = np.abs(ahead[:, 0]) + 1.0
+    for whole in (*(rates(seed, step=step) for step in (0.0, 1e-3, 0.05)), ahead):
+        assert fault == "two sensors" or not list(check(whole, RATE))
+    noise = 0.1 * np.random.default_rng(seed).standard_normal((2000, 3))
+    assert not list(check(rates(seed) + noise, RATE))
 
 
 @pytest.mark.parametrize(
