@@ -19,7 +19,6 @@ from mcap.records import Attachment, Metadata
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
-from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.mcap import (
     Damage,
     Found,
@@ -199,9 +198,7 @@ class _AmendedCopy:
             self.beginning_ns = first_ns
         wanted = self.anew.get(topic.name)
         # two types on one topic confuse every reader
-        if topic.name in self.taken or (
-            wanted is not None and short_name(topic.type_name) != short_name(wanted)
-        ):
+        if topic.name in self.taken or (wanted is not None and not topic.is_a(wanted)):
             raise LogError(
                 f"{self.source}: {topic.name} ({topic.type_name}) is in the log already; "
                 "leave it out where the log is made"

@@ -25,12 +25,17 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import (
     Struct,
     decode,
-    definition,
     parse_definition,
-    short_name,
 )
 from sonar_graph.logs.checks import stamp_faults
-from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, Topic, scan
+from sonar_graph.logs.mcap import (
+    STAMP_BYTES,
+    Keep,
+    Recording,
+    Topic,
+    keeping,
+    scan,
+)
 from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import (
     ROLES,
@@ -242,10 +247,9 @@ def inspect_log(
     config = as_log_config(config, call) or LogConfig()
     given = as_calibration(calibration, call)
     wanted = {} if topics is None else topics
-    types = wanted_types(config)
     recording = scan(
         path,
-        lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP,
+        keeping(wanted_types(config), Keep.STAMP),
         as_window(window, call),
     )
     require_topics(recording, wanted, config, call)
@@ -356,7 +360,7 @@ def _header_stamps(topic: Topic) -> Ints | None:
         for stack in topic.stacks.values()
         for rows, payloads in stack
     ]
-    decoded = decode(parse_definition(TIME, definition(TIME)), parts)
+    decoded = decode(parse_definition(TIME), parts)
     if decoded.unsound:
         return None
     stamps_ns = np.empty(len(topic), np.int64)
@@ -395,8 +399,7 @@ def starting_config(
     used = {choice.topic for choice in choices}
     if any(choice.topic is None and choice.role.is_required for choice in choices):
         for topic in recording.topics.values():
-            is_tree = short_name(topic.type_name) == short_name(TF)
-            if topic.name in used or not topic.is_ros2 or is_tree:
+            if topic.name in used or not topic.is_ros2 or topic.is_a(TF):
                 continue
             fields = [f"  {path}{size}" for path, size in _leaves(topic).items()]
             more = len(fields) - _MOST_FIELDS

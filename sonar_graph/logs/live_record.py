@@ -19,7 +19,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
+from sonar_graph.logs.cdr import Value, encode, parse_definition
 from sonar_graph.logs.mcap import (
     LogWriter,
     Recording,
@@ -48,7 +48,7 @@ NEWEST_FRAMES = "live.newest_frames_ns"
 def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
     """Reasons of the messages that the estimator was not given live, by topic and log time."""
     topic = recording.topics.get(DROPPED_TOPIC)
-    if topic is None or short_name(topic.type_name) != short_name(DROPPED):
+    if topic is None or not topic.is_a(DROPPED):
         return {}
     found = dict[tuple[str, int], str]()
     for group in topic.messages():
@@ -72,7 +72,7 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
         times_ns = topic.log_times_ns
         # a message is named by topic and log time
         gone_ns = [time_ns for name, time_ns in dropped if name == topic.name]
-        is_frames = short_name(topic.type_name) == short_name(TF) and topic.is_latched
+        is_frames = topic.is_a(TF) and topic.is_latched
         if newest_ns.isdecimal() and is_frames:
             gone_ns += times_ns[times_ns > int(newest_ns)].tolist()
         if gone_ns:
@@ -149,7 +149,7 @@ class LiveRecord:
         self._writer = LogWriter(self._stream)
         self._channels: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
-        self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
+        self._of_dropped = parse_definition(DROPPED)
 
     def __enter__(self) -> Self:
         return self

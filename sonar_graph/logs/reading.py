@@ -33,7 +33,6 @@ from sonar_graph.logs.adapters import (
     detection_warnings,
     shipped_like,
 )
-from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
     UNFELT,
@@ -52,11 +51,11 @@ from sonar_graph.logs.checks import (
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import (
-    Keep,
     Progress,
     Recording,
     TimeWindow,
     Topic,
+    keeping,
     scan,
 )
 from sonar_graph.logs.roles import (
@@ -252,19 +251,12 @@ def _scanned(
     progress: Progress | None,
 ) -> tuple[Recording, LogConfig]:
     """The messages of a log that may be needed, and the description of its topics: the given one, or its own."""
-
-    def scanned(types: frozenset[str]) -> Recording:
-        def keep(kind: str) -> Keep:
-            return Keep.ALL if short_name(kind) in types else Keep.NONE
-
-        return scan(path, keep, window, progress)
-
     types = wanted_types(config or LogConfig())
-    recording = scanned(types)
+    recording = scan(path, keeping(types), window, progress)
     used = config or recorded_config(recording) or LogConfig()
     # the types of its own topics are known only now
     if not wanted_types(used) <= types:
-        recording = scanned(wanted_types(used))
+        recording = scan(path, keeping(wanted_types(used)), window, progress)
     return recording, used
 
 

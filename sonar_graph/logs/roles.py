@@ -54,9 +54,8 @@ class Role:
     def fits(self, topic: Topic, *, general: bool) -> bool:
         """True where a topic fits one of the shipped adapters, of those that are general or of the others."""
         name = topic.name.lower()
-        kind = short_name(topic.type_name)
         return self.may_play(topic) and any(
-            short_name(offer.adapter.type) == kind
+            topic.is_a(offer.adapter.type)
             and any(word in name for word in offer.words or ("",))
             for offer in self.shipped
             if offer.is_general == general
@@ -98,12 +97,8 @@ def wanted_types(
     config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES
 ) -> frozenset[str]:
     """Types whose messages may be needed, without the ``msg``."""
-    shipped = {
-        short_name(offer.adapter.type)
-        for name in roles
-        for offer in ROLES[name].shipped
-    }
-    return config.types() | shipped | {short_name(TF), short_name(DROPPED)}
+    shipped = [one.adapter.type for name in roles for one in ROLES[name].shipped]
+    return config.types() | set(map(short_name, [*shipped, TF, DROPPED]))
 
 
 def refusal(topic: Topic) -> str | None:
@@ -131,7 +126,7 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
     if (reason := refusal(topic)) is not None:
         return reason
     table = config.table(role.name)
-    if "type" in table and short_name(table["type"]) != short_name(topic.type_name):
+    if "type" in table and not topic.is_a(table["type"]):
         return f"is a {topic.type_name}, and {config.source} asks for a {table['type']}"
     lacking: list[str] = []
     for adapter in config.adapters(role.name, topic.type_name):
@@ -164,34 +159,28 @@ def choose_topic(
     named = wanted or table.get("topic")
     asked = table.get("type")
     if named:
-        searches = [[topic for topic in topics if topic.name == named]]
-        by = "by name" if wanted else f"in {config.source}"
-        choice = _chosen(role, named, searches[0], config, by)
+        found = [topic for topic in topics if topic.name == named]
+        searches = [found]
+        adapter = adapter_for(role, found[0], config) if found else "is not in the log"
+        if isinstance(adapter, str):
+            choice = Choice(role, None, f"{named} was chosen but {adapter}")
+        else:
+            by = "by name" if wanted else f"in {config.source}"
+            choice = Choice(role, named, f"chosen {by}", adapter)
     else:
         # a type that any sensor may send counts only where no other fits
         searches = [
             [t for t in topics if role.fits(t, general=g)] for g in (False, True)
         ]
         if asked:
-            kind = short_name(asked)
-            searches = [[t for t in topics if short_name(t.type_name) == kind]]
-        found = (_only(role, config, fitting) for fitting in searches)
-        choice = next(filter(None, found), None) or _none_fits(role, topics, config)
+            searches = [[topic for topic in topics if topic.is_a(asked)]]
+        choices = (_only(role, config, fitting) for fitting in searches)
+        choice = next(filter(None, choices), None) or _none_fits(role, topics, config)
     if table and not choice.candidates:
         for topic in [topic for fitting in searches for topic in fitting]:
             if refusal(topic) is None and choice.topic in (None, topic.name):
                 config.require_fields(role.name, topic.type_name, topic.definition())
     return choice
-
-
-def _chosen(
-    role: Role, name: str, found: list[Topic], config: LogConfig, by: str
-) -> Choice:
-    """Choice of the topic of a name, where the log has it and it can be read."""
-    adapter = adapter_for(role, found[0], config) if found else "is not in the log"
-    if isinstance(adapter, str):
-        return Choice(role, None, f"{name} was chosen but {adapter}")
-    return Choice(role, name, f"chosen {by}", adapter)
 
 
 def _none_fits(role: Role, topics: list[Topic], config: LogConfig) -> Choice:

@@ -22,7 +22,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log, sonar_image_messages, write_log
-from sonar_graph.logs.mcap import Attachment, LogFile, recording, write_recording
+from sonar_graph.logs.mcap import LogFile, recording, write_recording
 from sonar_graph.logs.mcap.log_file import open_seal
 from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.measurements import Imu
@@ -160,8 +160,7 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     poses = pose_messages("/pose", truth)
     still = static_message("/start", poses.type_name, T0_NS, poses.payloads[:1])
-    file = Attachment("notes/a.json", "application/json", b'{"a": 1}')
-    write_recording(path, [still, poses], {"about": {"key": "value ψ"}}, [file])
+    write_recording(path, [still, poses], {"about": {"key": "value ψ"}})
     return path
 
 
@@ -181,9 +180,6 @@ def test_a_recording_has_the_records_of_rosbag2(
         assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
         about = {m.name: m.metadata for m in reader.iter_metadata()}["about"]
         assert open_seal(about) == ({"key": "value ψ"}, True)
-        (file,) = reader.iter_attachments()
-    found = (file.name, file.media_type, file.data)
-    assert found == ("notes/a.json", "application/json", b'{"a": 1}')
 
 
 def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> None:

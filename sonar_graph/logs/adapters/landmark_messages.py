@@ -141,12 +141,12 @@ class DetectionListsAdapter(Adapter):
                     f"{where} and {group['track'].shape[1]} tracks; expected as many, or none"
                 )
             tracks = group["track"].astype(np.int64).reshape(-1)
-        ranges, azimuths_rad, covariances, *posterior = (
+        range_m, azimuth_rad, pairs, identities, posterior = (
             column.reshape(len(message), -1) for column in columns
         )
-        pairs = covariances.reshape(-1, 2, 2)
-        values = (ranges[:, 0], azimuths_rad[:, 0], pairs, tracks)
-        return _Rows(message, *posterior, values)
+        covariances = pairs.reshape(-1, 2, 2)
+        values = (range_m[:, 0], azimuth_rad[:, 0], covariances, tracks)
+        return _Rows(message, identities, posterior, values)
 
 
 def _fit(

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters.adapter import Adapter
@@ -58,6 +58,10 @@ class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
     PATHS = ("data", "ranges", "range_resolution", "bearings", "directions", *KINDS)
+    EITHER = (
+        ("ranges", "range_resolution", "ranges or range_resolution"),
+        ("bearings", "directions", "bearings or directions"),
+    )
     data: str
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"
@@ -85,14 +89,6 @@ class SonarAdapter(Adapter):
     """Field that states whether each row begins with its gain, a uint32; samples are divided by its square root."""
     row_bytes: str | None = None
     """Field with the number of bytes of a row, gain and padding included."""
-
-    @model_validator(mode="after")
-    def _has_one_of_each(self) -> SonarAdapter:
-        if (self.ranges is None) == (self.range_resolution is None):
-            raise ValueError("give either ranges or range_resolution")
-        if (self.bearings is None) == (self.directions is None):
-            raise ValueError("give either bearings or directions")
-        return self
 
     def read(
         self, topic: Topic, refused: Refused | None = None

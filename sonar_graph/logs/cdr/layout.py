@@ -17,6 +17,7 @@ Other messages are left out and counted by their fault.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache
 from struct import Struct as Packing
@@ -43,11 +44,10 @@ class PayloadWalk:
 
     def __init__(
         self,
-        steps: int,
         length_of: Callable[[DecodingStep, int], int],
         most_elements: int | None,
     ) -> None:
-        self.found: list[list[int]] = [[] for _ in range(steps)]
+        self.found: dict[DecodingStep, list[int]] = defaultdict(list)
         """By step: the start of each block; for other steps start and count in turn."""
         self.words: list[tuple[int, int]] = []
         """Byte offset and value of each length word."""
@@ -68,8 +68,7 @@ class DecodingStep(ABC):
 
     is_text = False
 
-    def __init__(self, index: int, path: str) -> None:
-        self.index = index
+    def __init__(self, path: str) -> None:
         self.path = path
 
     @abstractmethod
@@ -91,8 +90,8 @@ class Value(NamedTuple):
 class FieldBlock(DecodingStep):
     """Neighbouring values of fixed number."""
 
-    def __init__(self, index: int, values: list[Value]) -> None:
-        super().__init__(index, values[0].path)
+    def __init__(self, values: list[Value]) -> None:
+        super().__init__(values[0].path)
         self.offsets = {value.path: [0] * _PHASES for value in values}
         """Offsets from the start of the block, by that start modulo 8."""
         self.counts = {value.path: value.number for value in values}
@@ -109,15 +108,15 @@ class FieldBlock(DecodingStep):
 
     def take(self, at: int, walk: PayloadWalk) -> int:
         """Note the start of the block, before any padding."""
-        walk.found[self.index].append(at)
+        walk.found[self].append(at)
         return at + self._sizes[at % _PHASES]
 
 
 class Counted(DecodingStep):
     """Values whose count is in the payload: a string, or a sequence of numbers."""
 
-    def __init__(self, index: int, path: str, kind: str, *, is_text: bool) -> None:
-        super().__init__(index, path)
+    def __init__(self, path: str, kind: str, *, is_text: bool) -> None:
+        super().__init__(path)
         self.is_text = is_text
         self._size = np.dtype(kind).itemsize
 
@@ -127,17 +126,15 @@ class Counted(DecodingStep):
         # numbers are aligned where there is one
         if count:
             at += padding(at, self._size)
-        walk.found[self.index] += (at, count)
+        walk.found[self] += (at, count)
         return at + count * self._size
 
 
 class Repeated(DecodingStep):
     """Array or sequence of strings or of another type."""
 
-    def __init__(
-        self, index: int, path: str, count: int | None, steps: list[DecodingStep]
-    ) -> None:
-        super().__init__(index, path)
+    def __init__(self, path: str, count: int | None, steps: list[DecodingStep]) -> None:
+        super().__init__(path)
         self._count = count
         self._steps = steps
 
@@ -145,7 +142,7 @@ class Repeated(DecodingStep):
         """Note the start and count of the elements, and walk through them."""
         # a fixed array has no length word
         at, count = walk.length(self, at) if self._count is None else (at, self._count)
-        walk.found[self.index] += (at, count)
+        walk.found[self] += (at, count)
         if walk.most_elements is not None and count > walk.most_elements:
             # every element has a byte at least, so this is beyond the end
             return at + count
@@ -174,7 +171,6 @@ class Plan:
         """Leaves by path, such as ``header.stamp.sec``; all elements of a sequence share one path."""
         self.sequences: dict[str, DecodingStep] = {}
         """Arrays and sequences by path, without arrays of numbers."""
-        self._parts = 0
         self._steps = self._compile(definition, "", is_single=True)
         self.texts = [path for path, leaf in self.leaves.items() if leaf.step.is_text]
         self.booleans = [path for path, leaf in self.leaves.items() if leaf.kind == "?"]
@@ -188,7 +184,7 @@ class Plan:
 
         An array of more than ``most_elements`` would reach beyond the end of the payload.
         """
-        walk = PayloadWalk(self._parts, length_of, most_elements)
+        walk = PayloadWalk(length_of, most_elements)
         for step in self._steps:
             walk.end = step.take(walk.end, walk)
         return walk
@@ -234,30 +230,26 @@ class Plan:
         else:
             is_text = entry.kind == STRING
             kind = PRIMITIVES.get(entry.kind, "u1")
-            counted = Counted(self._next(), path, kind, is_text=is_text)
+            counted = Counted(path, kind, is_text=is_text)
             self.leaves[path] = Leaf(counted, kind, is_single)
             # strings in an array or sequence have a length word each
             if not is_text or not entry.is_array:
                 return counted
             inner = [counted]
-        repeated = Repeated(self._next(), path, entry.length, inner)
+        repeated = Repeated(path, entry.length, inner)
         self.sequences[path] = repeated
         return repeated
 
     def _close(self, steps: list[DecodingStep], values: list[Value]) -> None:
         """Make a block of the values gathered so far."""
         if values:
-            block = FieldBlock(self._next(), values)
+            block = FieldBlock(values)
             steps.append(block)
             for path, kind, _, is_single in values:
                 # a type without fields has a byte that is no field
                 if path and not path.endswith("."):
                     self.leaves[path] = Leaf(block, kind, is_single)
             values.clear()
-
-    def _next(self) -> int:
-        self._parts += 1
-        return self._parts - 1
 
 
 @lru_cache(maxsize=256)
@@ -307,7 +299,7 @@ class Layout:
     def _place(self, path: str) -> PayloadColumn:
         step, kind, is_single = self.columns[path]
         dtype = np.dtype(self.byte_order + kind)
-        found = self._found[step.index]
+        found = self._found[step]
         if not isinstance(step, FieldBlock):
             return PayloadColumn(dtype, is_single, found[::2], found[1::2])
         offsets = step.offsets[path]
@@ -319,7 +311,7 @@ class Layout:
         """Number of elements of an array or sequence, one each time it occurs."""
         if path not in self.plan.sequences:
             return self.column(path).counts
-        return self._found[self.plan.sequences[path].index][1::2]
+        return self._found[self.plan.sequences[path]][1::2]
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
