@@ -43,8 +43,8 @@ def column(groups: Any, path: str) -> dict[int, Any]:
 
 @pytest.mark.parametrize("own", ["Part", "test_msgs/Part", "test_msgs/msg/Part"])
 def test_types_of_the_own_package_need_no_prefix_and_a_time_no_definition(
-    own: str,
-) -> None:
+    own,
+):
     text = f"{own} part\nbuiltin_interfaces/Time stamp"
     part, stamp = parsed(text, Part="float64 x").fields
     assert part.kind.name == "test_msgs/Part"
@@ -80,7 +80,7 @@ REFUSED = {
 }
 
 
-def test_a_definition_that_cannot_be_understood_is_refused_and_named() -> None:
+def test_a_definition_that_cannot_be_understood_is_refused_and_named():
     assert len(parse_definition(NAME, doubling(8)).fields) == 1
     for text, message in REFUSED.items():
         with pytest.raises(LogError, match=message):
@@ -95,12 +95,12 @@ def test_a_definition_that_cannot_be_understood_is_refused_and_named() -> None:
     [(40, 5, 1000), pytest.param(300, 10, 0, marks=pytest.mark.slow)],
 )
 def test_random_messages_decode_and_encode_as_with_two_other_libraries(
-    schemas: int, messages: int, seed: int
-) -> None:
+    schemas, messages, seed
+):
     assert check(schemas, messages, seed) == schemas * messages * 2
 
 
-def test_payloads_of_one_length_differ_in_layout_and_byte_order() -> None:
+def test_payloads_of_one_length_differ_in_layout_and_byte_order():
     sizes = [(4 * i, 160 - 4 * i) for i in range(41) for _ in "<>"]
     payloads = [
         bytes([0, order == "<", 0, 0])
@@ -111,7 +111,7 @@ def test_payloads_of_one_length_differ_in_layout_and_byte_order() -> None:
     assert column(groups, "c") == {row: row for row in range(82)}
 
 
-def test_what_does_not_fit_or_exist_is_neither_written_nor_read() -> None:
+def test_what_does_not_fit_or_exist_is_neither_written_nor_read():
     definition = parsed("uint8 a\nint32[] b\nP[] points", P="int16 x\nstring s")
     assert encode(definition, 2, {"a": np.array([0, 255])})[:, 4].tolist() == [0, 255]
     for values in (
@@ -179,9 +179,7 @@ BROKEN: dict[str, tuple[bytes, str]] = {
 
 @pytest.mark.parametrize("kind", BROKEN)
 @pytest.mark.parametrize("place", [0, 1, 3], ids=["first", "among", "last"])
-def test_a_broken_message_is_named_and_those_around_it_are_read(
-    kind: str, place: int
-) -> None:
+def test_a_broken_message_is_named_and_those_around_it_are_read(kind, place):
     payload, fault = BROKEN[kind]
     payloads = [whole(last=i) for i in range(3)]
     payloads.insert(place, payload)
@@ -195,8 +193,8 @@ def test_a_broken_message_is_named_and_those_around_it_are_read(
 
 @given(st.binary(max_size=80), st.integers(0, 46), st.integers(0, 46))
 def test_no_bytes_crash_and_what_is_sound_is_what_another_library_reads(
-    noise: bytes, start: int, end: int
-) -> None:
+    noise, start, end
+):
     payload = whole()[:start] + noise + whole()[end:]
     decoded = decode(DEFINITION, stacked([payload]))
     assert len(decoded.groups) + len(decoded.unsound) == 1
@@ -238,9 +236,7 @@ MANY: dict[str, tuple[Struct, list[bytes]]] = {
 
 
 @pytest.mark.parametrize(("definition", "payloads"), MANY.values(), ids=MANY)
-def test_many_broken_messages_are_read_in_seconds(
-    definition: Struct, payloads: list[bytes]
-) -> None:
+def test_many_broken_messages_are_read_in_seconds(definition, payloads):
     stacks = stacked(payloads)
     start = time.process_time()
     decoded = decode(definition, stacks)

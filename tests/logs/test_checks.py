@@ -117,8 +117,8 @@ GAPS: dict[str, tuple[Imu, Dvl, Calibration, list[str]]] = {
     ("inertial", "doppler", "calibration", "expected"), GAPS.values(), ids=GAPS
 )
 def test_each_gap_is_named_with_its_times_and_the_assumption_in_it(
-    inertial: Imu, doppler: Dvl, calibration: Calibration, expected: list[str]
-) -> None:
+    inertial, doppler, calibration, expected
+):
     found = list(gap_warnings(inertial, doppler, calibration))
     assert len(found) == len(expected)
     assert all(
@@ -129,7 +129,7 @@ def test_each_gap_is_named_with_its_times_and_the_assumption_in_it(
 @pytest.mark.parametrize(
     ("gap_s", "first_s", "is_told"), [(1.4, 0.9, False), (1.6, 1.1, True)]
 )
-def test_a_gap_begins_at_its_limit(gap_s: float, first_s: float, is_told: bool) -> None:
+def test_a_gap_begins_at_its_limit(gap_s, first_s, is_told):
     later = np.concatenate([PINGS[:500], PINGS[500:] - 0.2 + gap_s])
     for inertial, doppler, calibration in (
         (imu(SAMPLES[1000:20001]), dvl(10.0 + gap_s + PINGS[:951]), USUAL),
@@ -178,9 +178,7 @@ FIRST = np.arange(100)
         ),
     ],
 )
-def test_each_fault_of_stamps_is_told_alone(
-    stamps_ns: Any, log_times_ns: Any, expected: str | None
-) -> None:
+def test_each_fault_of_stamps_is_told_alone(stamps_ns, log_times_ns, expected):
     found = list(stamp_faults(stamps_ns, log_times_ns))
     assert len(found) == (expected is not None)
     assert expected is None or found[0].startswith(expected)
@@ -214,7 +212,7 @@ SHAKING = 2.0 * np.random.default_rng(3).standard_normal((3000, 3))
         *((turning((row, -4.0)), "1 angular rate stands out") for row in (1, 1500, 2998)),
     ],
 )  # fmt: skip
-def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -> None:
+def test_only_single_wild_rates_are_spikes(rate, expected):
     found = spike_warning(
         EVEN[0] + np.arange(len(rate)) * SECOND // 100, rate, "angular rate"
     )
@@ -222,7 +220,7 @@ def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -
     assert (found is None) == (expected is None)
 
 
-def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck() -> None:
+def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck():
     rng = np.random.default_rng(4)
     stamps_ns = EVEN[0] + np.arange(1500) * SECOND // 5
     way = 0.5 * (stamps_ns - stamps_ns[0]) * 1e-9
@@ -270,8 +268,8 @@ ZEROS = [(slice(60 + 40 * k, 80 + 41 * k), 0.0) for k in range(5)]
     ],
 )  # fmt: skip
 def test_equal_rows_of_more_than_a_second_and_five_rows_are_named(
-    values: Floats, rate_hz: float, expected: list[str]
-) -> None:
+    values, rate_hz, expected
+):
     found = stuck_warning(stamps(np.arange(len(values)) / rate_hz), values, "velocity")
     assert (found is not None) == bool(expected)
     assert all(part in str(found) for part in expected)
@@ -295,8 +293,8 @@ STOPPED = moving((slice(100, 200), 0.3))
     ],
 )  # fmt: skip
 def test_a_quantity_that_repeats_while_others_change_is_stuck(
-    quantity: str, values: Floats, others: Floats, is_stuck: bool
-) -> None:
+    quantity, values, others, is_stuck
+):
     rows = {quantity: (EVERY_TENTH_S, values), "force": (EVERY_TENTH_S, others)}
     stuck = stuck_rows(quantity, rows)
     at = np.arange(100, 200) if is_stuck else []
@@ -306,7 +304,7 @@ def test_a_quantity_that_repeats_while_others_change_is_stuck(
     assert (found or "").startswith(said) == is_stuck == bool(found)
 
 
-def test_frames_that_repeat_while_the_vehicle_moves_are_stuck() -> None:
+def test_frames_that_repeat_while_the_vehicle_moves_are_stuck():
     """Three sightings a frame; the frames from the tenth on repeat it, or only its azimuth."""
     frame = np.repeat(np.arange(40), 3)
     seen = np.random.default_rng(1).uniform(1.0, 9.0, (120, 2))
@@ -330,7 +328,7 @@ def test_frames_that_repeat_while_the_vehicle_moves_are_stuck() -> None:
 # --- enough for an estimator ----------------------------------------------------------------------------------------
 
 
-def test_one_common_instant_is_enough_and_one_whole_velocity() -> None:
+def test_one_common_instant_is_enough_and_one_whole_velocity():
     five = np.arange(5.0)
     require_use("log.mcap", imu(five), dvl(five + 4))
     require_use("log.mcap", imu(five), dvl(five, five != 3))
@@ -370,7 +368,7 @@ def alternating(values: Floats) -> Floats:
 
 @pytest.mark.parametrize("fault", FAULTY)
 @pytest.mark.parametrize("seed", range(3))
-def test_a_faulty_axis_is_named_and_none_of_a_whole_sensor(fault: str, seed: int):
+def test_a_faulty_axis_is_named_and_none_of_a_whole_sensor(fault, seed):
     check, values, expected = FAULTY[fault]
     found = list(check(values(seed), RATE))
     assert len(found) == len(expected)
@@ -391,7 +389,7 @@ def test_a_faulty_axis_is_named_and_none_of_a_whole_sensor(fault: str, seed: int
     ],
 )
 def test_a_constant_vertical_velocity_of_a_diving_vehicle_is_doubted(
-    has_depth: bool, sigma_m_s: float, is_named: bool
+    has_depth, sigma_m_s, is_named
 ):
     t = np.arange(2000) * 0.02
     imu = Imu(stamps(t), rates(0), np.tile([0.0, 0.0, 9.8], (2000, 1)))
@@ -437,7 +435,7 @@ def test_two_imus_on_one_topic_are_named_and_gravity_is_not_missing():
     assert "two IMUs" in found
 
 
-def test_a_yaw_that_stands_still_in_an_orientation_that_tilts_repeats_itself() -> None:
+def test_a_yaw_that_stands_still_in_an_orientation_that_tilts_repeats_itself():
     """Yaw of quaternions whose roll changes is the same but for rounding."""
     roll = np.linspace(0.0, 0.3, 200)
     yaw = np.full(200, 1.0)

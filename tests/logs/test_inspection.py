@@ -22,14 +22,14 @@ from sonar_graph.logs.mcap import Keep, scan
 from sonar_graph.logs.roles import choose_topic, refusal
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
-from .conftest import T0_NS, Bench, Change, copy, recorded, writing
+from .conftest import T0_NS, Change, copy, recorded, writing
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
     return next((r.topic, r.reason) for r in summary.roles if r.role == name)
 
 
-def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
+def test_roles_are_explained_whether_filled_or_not(bench):
     imu, dvl = bench.basics()
     odometry = ("/odom", "odometry", [bench.odometry(bench.t0_ns, 0.0)])
     path = bench.write(imu, dvl, ("/second", "imu", imu[2]), odometry)
@@ -63,7 +63,7 @@ def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
 
 
 @pytest.mark.recording
-def test_a_third_party_log_is_described(recordings: Path) -> None:
+def test_a_third_party_log_is_described(recordings):
     summary = inspect_log(recordings / "bags" / "nav2_turtlebot.mcap")
     counts = {t.name: t.messages for t in summary.topics}
     assert counts == {"/amcl_pose": 135, "/odom": 2639, "/tf": 5422, "/tf_static": 1}
@@ -73,7 +73,7 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
     assert summary.damage == ()
 
 
-def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> None:
+def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench):
     imu, _ = bench.basics()
     sideways = [
         message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}}
@@ -101,7 +101,7 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> No
     assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
 
 
-def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
+def test_what_this_package_wrote_gives_no_warning(tmp_path):
     write_log(tmp_path / "a.mcap", read_victoria_park())
     write_log(
         tmp_path / "b.mcap",
@@ -197,8 +197,8 @@ def copied(
 
 
 def test_unreadable_topics_are_listed_with_the_reason(
-    bench: Bench,
-) -> None:
+    bench,
+):
     path = bench.write(*bench.basics())
     mixed = copied(path, beside=True)
     topics = {topic.name: topic for topic in inspect_log(mixed).topics}
@@ -223,8 +223,8 @@ def test_unreadable_topics_are_listed_with_the_reason(
     ("role", "column"), [("imu", "angular_velocity"), ("depth", "z_m")]
 )
 def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
-    bench: Bench, role: str, column: str
-) -> None:
+    bench, role, column
+):
     """A sensor that no estimator needs may have no whole message at all."""
     pressures = [bench.pressure(bench.t0_ns + i, 2e5) for i in range(9)]
     path = bench.write(*bench.basics(9), ("/depth", "pressure", pressures))
@@ -271,9 +271,7 @@ def choices(path: Path, config: LogConfig) -> dict[str, object]:
     return {name: (c.topic, c.candidates, adapters[name]) for name, c in found.items()}
 
 
-def test_read_back_unchanged_it_makes_the_same_choices(
-    bench: Bench, make_sequence: Any, tmp_path: Path
-) -> None:
+def test_read_back_unchanged_it_makes_the_same_choices(bench, make_sequence, tmp_path):
     imu, dvl = bench.basics()
     poses = [bench.odometry(bench.t0_ns, 0.0)]
     pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns, 2e5)])
@@ -300,7 +298,7 @@ def test_read_back_unchanged_it_makes_the_same_choices(
         assert choices(path, config) == choices(path, again)
 
 
-def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench) -> None:
+def test_an_unknown_type_is_proposed_with_its_fields(bench):
     own = "float64 time\nfloat64[3] speed\nfloat32[] beams\n"
     rows = [{"time": 0.0, "speed": [1.0, 2.0, 3.0], "beams": []}] * 3
     path = bench.write(

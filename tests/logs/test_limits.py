@@ -6,7 +6,6 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import lz4.frame
 import numpy as np
@@ -54,12 +53,12 @@ def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> P
     [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)],
 )
 def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    compression: str,
-    size: int,
-    stated: int,
-) -> None:
+    tmp_path,
+    monkeypatch,
+    compression,
+    size,
+    stated,
+):
     monkeypatch.setattr(chunks, "LARGEST_BYTES", LIMIT)
     path = log_with_chunk(tmp_path / "log.mcap", bytes(size), compression, stated)
     (loss,) = scanning.scan(path, lambda _: Keep.ALL).damage.losses
@@ -73,8 +72,8 @@ def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
 
 
 def test_messages_far_larger_than_their_file_are_refused(
-    tmp_path: Path, monkeypatch: Any, make_sequence: Any
-) -> None:
+    tmp_path, monkeypatch, make_sequence
+):
     write_recording(
         tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {}
     )
@@ -89,9 +88,7 @@ def test_messages_far_larger_than_their_file_are_refused(
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(
-    tmp_path: Path, kind: str
-) -> None:
+def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(tmp_path, kind):
     path = tmp_path / "in.mcap"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
     for read in (read_log, inspect_log):
@@ -104,7 +101,7 @@ def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(
         PartialCalibration.read(path)
 
 
-def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
+def test_a_text_that_is_too_large_is_refused_unread(tmp_path):
     path = tmp_path / "a.toml"
     path.touch()
     os.truncate(path, LARGEST_TEXT + 1)  # without a block on the disk
@@ -130,8 +127,8 @@ TRANSLATION = "numbers that are not finite"
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
-    bench: Any, changed: dict[str, Any], message: str
-) -> None:
+    bench, changed, message
+):
     transform = bench.transform("base_link", "dvl_link", (0, 0, 0))
     for part, numbers in changed.items():
         transform["transform"][part] |= numbers
@@ -157,8 +154,8 @@ SLOW: dict[str, str] = {
 
 @pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
 def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(
-    text: str,
-) -> None:
+    text,
+):
     began = time.process_time()
     for kind in ("p/msg/A", "p/msg/B"):
         for _ in range(5):

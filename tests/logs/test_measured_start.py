@@ -58,8 +58,8 @@ def off(found: Floats | tuple[float, ...], true: Any) -> Floats:
 
 @pytest.mark.parametrize("rpy", [RPY, (0.0, 0.0, -2.0), (-0.2, 0.2, 3.0)])
 def test_each_part_of_the_start_is_within_its_sigma_of_the_truth(
-    rpy: tuple[float, float, float],
-) -> None:
+    rpy,
+):
     blocks = moving(rpy)
     calibration, note = with_measured_start(Calibration(), blocks)
     start = calibration.start
@@ -73,7 +73,7 @@ def test_each_part_of_the_start_is_within_its_sigma_of_the_truth(
     )
 
 
-def test_what_is_stated_stays_and_the_rest_is_measured() -> None:
+def test_what_is_stated_stays_and_the_rest_is_measured():
     blocks = moving()
     place = Calibration(start=Start(position_m=(1.0, 2.0, 3.0)))
     of_place = with_measured_start(place, blocks)[0].start

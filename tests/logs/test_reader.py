@@ -76,9 +76,7 @@ CONTAINERS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("options", CONTAINERS.values(), ids=CONTAINERS)
-def test_every_message_is_found_whatever_the_container(
-    path: Path, options: dict[str, Any]
-) -> None:
+def test_every_message_is_found_whatever_the_container(path, options):
     written = write(path, **options)
     assert read(path) == written
     calls: list[tuple[int, int]] = []
@@ -231,9 +229,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(
-    path: Path, name: str
-) -> None:
+def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path, name):
     fault = FAULTS[name]
     written = write(path, **fault.options)
     chunks = chunk_indexes(path)
@@ -292,8 +288,8 @@ RANDOM = settings(
 @example("remove", 0.859375, 1209)
 @pytest.mark.parametrize("compression", [ZSTD, NONE])
 def test_no_damage_makes_up_a_message_or_loses_one_silently(
-    path: Path, compression: CompressionType, how: str, part: float, count: int
-) -> None:
+    path, compression, how, part, count
+):
     written = write(path, 200, compression=compression)
     content = path.read_bytes()
     at = 8 + int(part * (len(content) - 9))
@@ -320,8 +316,8 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
 
 
 def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
-    path: Path,
-) -> None:
+    path,
+):
     """Without a CRC that could be checked, those of an uncompressed chunk are no messages outside chunks either."""
     write(path, chunk_size=1 << 20, compression=NONE)
     (chunk,) = chunk_indexes(path)
@@ -342,8 +338,8 @@ def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
 
 
 def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
-    path: Path,
-) -> None:
+    path,
+):
     for options, named in (
         (
             {"use_chunking": False},
@@ -377,8 +373,8 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
 
 
 def test_a_truncated_file_is_read_up_to_the_cut(
-    path: Path,
-) -> None:
+    path,
+):
     written = write(path)
     chunks = chunk_indexes(path)
     content = path.read_bytes()
@@ -399,9 +395,7 @@ def test_a_truncated_file_is_read_up_to_the_cut(
 
 
 @pytest.mark.parametrize("compression", [ZSTD, LZ4, NONE])
-def test_half_a_chunk_gives_its_whole_messages(
-    path: Path, compression: CompressionType
-) -> None:
+def test_half_a_chunk_gives_its_whole_messages(path, compression):
     written = write(path, 12_000, chunk_size=1 << 18, compression=compression)
     second = chunk_indexes(path)[1]
     before = int(
@@ -458,7 +452,7 @@ OTHER_FILES = {
 }
 
 
-def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
+def test_other_files_are_named_for_what_they_are(tmp_path):
     path = tmp_path / "log.bag"
     for content, kind in OTHER_FILES.items():
         path.write_bytes(content)
@@ -479,7 +473,7 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
             scan_all(path)
 
 
-def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -> None:
+def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path):
     write_apart(path)
     recording = scan_all(path, TimeWindow(Instant.parse("10"), Instant.parse("20")))
     times_s = sorted(
@@ -515,8 +509,8 @@ BEGINNING_NS = 1_700_000_000_000_000_001
     ],
 )
 def test_a_window_takes_seconds_and_dates_and_refuses_all_else(
-    text: str,
-) -> None:
+    text,
+):
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
     zoned = Instant.parse("1970-01-02T01:00:01.5+01:00")
     assert zoned.resolve(BEGINNING_NS) == 86_401_500_000_000

@@ -1,7 +1,6 @@
 """A log as a sequence: topics, stamps, rows left out, detections, damage, and the account of all that in the notes."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,8 +40,8 @@ REFUSED_CHOICES: list[tuple[str, dict[str, str], type[Exception], str]] = [
 
 
 def test_the_chosen_topic_is_read_and_impossible_ones_are_refused(
-    bench: Bench,
-) -> None:
+    bench,
+):
     fast = [bench.imu(T0_NS + i * STEP_NS, (0, 0, 7.0)) for i in range(5)]
     entries = [*bench.basics(), ("/other", "imu", fast)]
     for there, topics, error, message in REFUSED_CHOICES:
@@ -67,9 +66,7 @@ def test_the_chosen_topic_is_read_and_impossible_ones_are_refused(
     assert "imu: /other" in chosen.notes["log.topics"]
 
 
-def test_paths_may_be_texts_and_a_window_two_times(
-    bench: Bench, tmp_path: Path
-) -> None:
+def test_paths_may_be_texts_and_a_window_two_times(bench, tmp_path):
     path = bench.write(*bench.basics())
     setup = tmp_path / "setup.toml"
     setup.write_text("[imu]\ngyro_bias_sigma = 0.25")
@@ -108,15 +105,13 @@ def test_paths_may_be_texts_and_a_window_two_times(
     ],
 )  # fmt: skip
 def test_a_wrong_argument_is_an_error_of_this_package_with_what_mends_it(
-    bench: Bench, call: Callable[[Path], object], said: str
-) -> None:
+    bench, call, said
+):
     with pytest.raises(SonarGraphError, match=said):
         call(bench.write(*bench.basics()))
 
 
-def test_zero_noise_raises_a_doubt_where_the_log_has_none(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+def test_zero_noise_raises_a_doubt_where_the_log_has_none(make_sequence, tmp_path):
     write_log(tmp_path / "a.mcap", make_sequence())
     (tmp_path / "a.toml").write_text("[dvl]\nvelocity_sigma_m_s = [0.0, 0.1, 0.1]")
     given = tmp_path / "a.toml"
@@ -133,7 +128,7 @@ def test_zero_noise_raises_a_doubt_where_the_log_has_none(
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def test_stamps_are_the_headers_sorted_and_once(bench: Bench) -> None:
+def test_stamps_are_the_headers_sorted_and_once(bench):
     _, dvl = bench.basics()
     imu = [
         bench.imu(T0_NS + k * STEP_NS, (float(i), 0, 0))
@@ -157,8 +152,8 @@ def detected(bench: Bench, *frames: dict[str, Any]) -> Path:
 
 
 def test_detections_are_padded_and_keep_their_tracks(
-    bench: Bench,
-) -> None:
+    bench,
+):
     """Also when messages of one log differ in having tracks."""
     frames = [
         bench.detections(T0_NS, [1.0, 2.0], [5, 6], (4, 3)),
@@ -218,9 +213,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("changed", "message"), REFUSED.values(), ids=REFUSED)
-def test_a_message_that_breaks_its_rules_is_named(
-    bench: Bench, changed: dict[str, Any], message: str
-) -> None:
+def test_a_message_that_breaks_its_rules_is_named(bench, changed, message):
     path = one_of(bench, **changed)
     with pytest.raises(LogError, match=message) as caught:
         read_log(path)
@@ -279,8 +272,8 @@ TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
 
 @pytest.mark.parametrize(("changed", "rows", "account"), TOLD.values(), ids=TOLD)
 def test_unusable_detections_are_reported_and_impossible_ones_left_out(
-    bench: Bench, changed: dict[str, Any], rows: int, account: str
-) -> None:
+    bench, changed, rows, account
+):
     path = one_of(bench, **changed)
     sequence = read_log(path)
     summary = inspect_log(path)
@@ -314,9 +307,7 @@ def long(make_sequence: Any, tmp_path: Path, monkeypatch: Any) -> tuple[Any, Pat
     return sequence, tmp_path / "a.mcap"
 
 
-def test_a_truncated_log_is_read_and_a_hole_needs_salvage(
-    long: tuple[Any, Path], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_truncated_log_is_read_and_a_hole_needs_salvage(long, caplog):
     sequence, path = long
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
@@ -358,9 +349,7 @@ LATER = TimeWindow(Instant.parse("2"))
         (None, TimeWindow(Instant.parse("0")), False),
     ],
 )
-def test_a_start_pose_of_another_instant_is_noted(
-    long: tuple[Any, Path], stated: Any, window: TimeWindow, is_told: bool
-) -> None:
+def test_a_start_pose_of_another_instant_is_noted(long, stated, window, is_told):
     given = PartialCalibration.parse(stated, "x.toml") if stated else None
     notes = read_log(long[1], window=window, calibration=given).notes
     assert ("log.start_pose" in notes) == is_told

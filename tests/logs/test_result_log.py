@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -255,8 +254,8 @@ def xyz(vector: Any) -> list[float]:
 
 
 def test_landmarks_are_drawn_as_ellipsoids_of_their_covariance(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
     turn = Rotation.from_euler("z", 45, degrees=True).as_matrix()
     stick = turn @ np.diag([1.0, 0.04, 0.01]) @ turn.T
@@ -288,7 +287,7 @@ def test_landmarks_are_drawn_as_ellipsoids_of_their_covariance(
 # --- pictures ----------------------------------------------------------------------------------------------
 
 
-def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) -> None:
+def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path):
     """Of different sizes, as JPEG files are."""
     images = [np.full((20, 30 + 40 * k), 90 * k, np.uint8) for k in range(3)]
     contents = [cv2.imencode(".jpg", image)[1].tobytes() for image in images]
@@ -304,7 +303,7 @@ def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) 
 # --- layouts --------------------------------------------------------------------------------------------------------
 
 
-def test_an_empty_scene_can_be_drawn(make_sequence: Any, tmp_path: Path) -> None:
+def test_an_empty_scene_can_be_drawn(make_sequence, tmp_path):
     layer = Layer("/a/path", "nav_msgs/msg/Path", (1, 0, 0, 1))
     layout = foxglove_layout([layer], Scene.around([np.empty((0, 3))]))
     assert json.dumps(layout, allow_nan=False)

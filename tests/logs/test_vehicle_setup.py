@@ -57,9 +57,7 @@ def written(
 # --- mountings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(make_sequence, tmp_path):
     sequence = make_sequence()
     mounting = Mounting(rpy_rad=(0.0, 0.5, 0.0))
     frames = SonarFrames(
@@ -109,16 +107,16 @@ NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsa
     ("frame", "frames", "body_T_sensor"), NAMED_TREES.values(), ids=NAMED_TREES
 )
 def test_a_frame_is_found_below_the_body_of_any_name(
-    frame: str,
-    frames: dict[str, tuple[str, gtsam.Pose3 | str]],
-    body_T_sensor: gtsam.Pose3,
-) -> None:
+    frame,
+    frames,
+    body_T_sensor,
+):
     found = mounting_of(frame, frames)
     assert found is not None
     assert found.pose().equals(body_T_sensor, 1e-12)
 
 
-def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench: Any) -> None:
+def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench):
     tree = {"transforms": [bench.transform("base_link", "dvl_link", (1, 2, 3))]}
     mountings = []
     # two seconds after the first file, and an hour later: another recording
@@ -173,9 +171,7 @@ def nested(flat: dict[str, Any]) -> dict[str, Any]:
 
 
 @given(SOME, SOME, st.sets(st.sampled_from(["imu", "dvl", "depth", "sonar"])))
-def test_every_field_comes_from_the_first_that_says_it(
-    of_file: dict[str, Any], of_record: dict[str, Any], in_tree: set[str]
-) -> None:
+def test_every_field_comes_from_the_first_that_says_it(of_file, of_record, in_tree):
     recorded = Calibration.model_validate(nested(of_record))
     tree = {name: Mounting(translation_m=TREE_M, rpy_rad=(0, 0, 1)) for name in in_tree}
     found = leaves(gathered(said(**nested(of_file)), recorded, tree).model_dump())
@@ -189,7 +185,7 @@ def test_every_field_comes_from_the_first_that_says_it(
     assert found == expected | of_record | of_file
 
 
-def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:
+def test_a_section_is_completed_by_the_log_or_taken_away_by_false():
     floor = gathered(said(floor={"z_m": -2}), FLOOR, {}).floor
     assert floor is not None
     assert (floor.z_m, floor.sigma_m) == (-2, 0.1)
@@ -231,8 +227,8 @@ BROKEN_RECORDS: list[tuple[dict[str, str], type[Exception], str]] = [
 
 
 def test_mistakes_are_found_before_a_log_is_read_and_broken_records_named(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+    make_sequence, tmp_path
+):
     for values, message in MISTAKES:
         with pytest.raises(CalibrationError, match=message):
             said(**values)

@@ -165,8 +165,8 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_recording_has_the_records_of_rosbag2(
-    long_log: Path,
-) -> None:
+    long_log,
+):
     with long_log.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
@@ -182,7 +182,7 @@ def test_a_recording_has_the_records_of_rosbag2(
         assert open_seal(about) == ({"key": "value ψ"}, True)
 
 
-def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> None:
+def test_crcs_cover_each_chunk_and_all_data(long_log, tmp_path):
     with LogFile(long_log) as file:
         assert (file.summary is not None, file.fault) == (True, None)
         stated = int.from_bytes(file.read(file.data_end_at + 9, 4), "little")
@@ -199,8 +199,8 @@ def test_crcs_cover_each_chunk_and_all_data(long_log: Path, tmp_path: Path) -> N
 
 
 def test_latched_topics_offer_transient_local_qos(
-    long_log: Path,
-) -> None:
+    long_log,
+):
     """Versions that would expect words read numbers when the record ``rosbag2`` has no metadata of theirs."""
     with AnyReader([long_log]) as reader:
         offered = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
@@ -218,7 +218,7 @@ def test_latched_topics_offer_transient_local_qos(
         assert records["rosbag2"] == {"serialized_metadata": ""}
 
 
-def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_file_has_its_name_only_when_it_is_whole(tmp_path):
     def break_off(path: Path) -> None:
         with written_whole(path) as stream:
             stream.write(b"half")
@@ -257,7 +257,7 @@ write_recording(Path(sys.argv[1]), [Outgoing("/n", "std_msgs/msg/Header", np.ara
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL here")
-def test_a_killed_writer_loses_at_most_its_open_chunk(tmp_path: Path) -> None:
+def test_a_killed_writer_loses_at_most_its_open_chunk(tmp_path):
     path = tmp_path / "log.mcap"
     with subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE

@@ -56,9 +56,7 @@ def without_lock(run: Sequence, begin_s: float, end_s: float) -> Sequence:
 @pytest.mark.parametrize(
     ("begin_s", "end_s"), [(20.0, 22.0), (20.0, 35.0), (0.0, 9.0), (50.0, 60.0)]
 )
-def test_zeros_without_lock_are_found_at_every_rate_and_place(
-    rate_hz: float, begin_s: float, end_s: float
-) -> None:
+def test_zeros_without_lock_are_found_at_every_rate_and_place(rate_hz, begin_s, end_s):
     run = without_lock(drive(rate_hz, cruise), begin_s, end_s)
     t = run.dvl.stamps_ns / SECOND
     found = unfelt_zeros(run.imu, run.dvl, run.calibration)
@@ -67,7 +65,7 @@ def test_zeros_without_lock_are_found_at_every_rate_and_place(
 
 def test_a_log_with_zeros_is_read_without_them_unless_they_are_measured(
     tmp_path,
-) -> None:
+):
     path = tmp_path / "dive.mcap"
     run = without_lock(drive(1.0, cruise), 20.0, 35.0)
     write_log(tmp_path / "own.mcap", run)

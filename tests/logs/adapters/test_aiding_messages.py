@@ -175,16 +175,12 @@ EARTH: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_headings_and_fixes_of_any_driver_become_measurements(
-    foreign: Any, case: Case
-) -> None:
+def test_headings_and_fixes_of_any_driver_become_measurements(foreign, case):
     assert "log.origin" not in foreign.check(*case).notes
 
 
 @pytest.mark.parametrize("case", EARTH.values(), ids=EARTH)
-def test_positions_on_the_earth_become_metres_from_an_origin(
-    foreign: Any, case: Case
-) -> None:
+def test_positions_on_the_earth_become_metres_from_an_origin(foreign, case):
     """To a tenth of a millimetre, by the radius of curvature."""
     entries, toml, expected, notes = case
     sequence = foreign.check(entries, toml, {}, {"log.origin": "of the world"} | notes)
@@ -194,7 +190,7 @@ def test_positions_on_the_earth_become_metres_from_an_origin(
         )
 
 
-def test_of_several_orientations_that_of_the_imu_in_use_counts(foreign: Any) -> None:
+def test_of_several_orientations_that_of_the_imu_in_use_counts(foreign):
     entries = [oriented(YAW), oriented(Rotation.identity(), topic="/imu/second"), dvl()]
     for topic, yaw_rad in (("/imu", 0.5), ("/imu/second", 0.0)):
         sequence = foreign.read(*entries, topics={"imu": topic})
@@ -213,8 +209,8 @@ def imu_of(topic: str) -> Entry:
 
 
 def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(
-    foreign: Any,
-) -> None:
+    foreign,
+):
     """A NavSatFix of any other name is; and an inspection offers no truth as a Doppler log."""
     truth = fixes(fix(), fix(1.0), topic="/truth/fix")
     assert foreign.read(truth).positions is None
@@ -254,8 +250,8 @@ def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
 
 
 def test_a_constant_true_orientation_raises_a_doubt(
-    foreign: Any,
-) -> None:
+    foreign,
+):
     still = moving(0.3, 0.3, 0.3)
     notes = foreign.read(still, toml=FRD_DVL).notes["log.warnings"]
     assert (
@@ -280,9 +276,7 @@ def test_a_constant_true_orientation_raises_a_doubt(
         ('[positions]\ntype = "a/msg/B"', "give either position"),
     ],
 )
-def test_a_table_without_a_source_of_its_numbers_is_refused(
-    foreign: Any, toml: str, said: str
-) -> None:
+def test_a_table_without_a_source_of_its_numbers_is_refused(foreign, toml, said):
     with pytest.raises(LogError, match=said):
         foreign.read(toml=toml)
 
@@ -306,8 +300,8 @@ ANTENNA = "[positions]\nantenna_m = [1.0, 0.0, 0.0]\n"
 
 @pytest.mark.parametrize("wrong", [-1, 0, 4])
 def test_an_unknown_start_is_that_of_the_first_headings_and_fixes(
-    foreign: Any, tmp_path: Any, wrong: int
-) -> None:
+    foreign, tmp_path, wrong
+):
     """With three times their sigma, of a vehicle at rest; one wrong row does not count."""
     calibration = tmp_path / "vehicle.toml"
     calibration.write_text(ANTENNA)
@@ -327,7 +321,7 @@ def test_an_unknown_start_is_that_of_the_first_headings_and_fixes(
     )
 
 
-def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not() -> None:
+def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not():
     turns = np.linspace(0.3, 9.0, 50)
     assert is_unwrapped(turns)
     assert not is_unwrapped(np.degrees(turns))
@@ -338,9 +332,7 @@ def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not() -> No
 @pytest.mark.parametrize(
     "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
 )
-def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(
-    foreign: Any, said: dict[str, float]
-) -> None:
+def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(foreign, said):
     log = foreign.write(oriented(YAW, **said), dvl())
     assert foreign.read(oriented(YAW, **said), dvl()).heading is None
     (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]

@@ -198,7 +198,7 @@ CASES: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_velocities(foreign: Any, case: Case) -> None:
+def test_messages_of_any_driver_become_velocities(foreign, case):
     entries, *others = case
     foreign.check([imu(), *entries], *others)
 
@@ -223,9 +223,7 @@ def test_messages_of_any_driver_become_velocities(foreign: Any, case: Case) -> N
         ),
     ],
 )
-def test_what_cannot_be_a_doppler_log_is_named(
-    foreign: Any, entry: Entry, toml: str, message: str
-) -> None:
+def test_what_cannot_be_a_doppler_log_is_named(foreign, entry, toml, message):
     with pytest.raises(LogError, match=message):
         foreign.read(imu(), entry, toml=toml)
 
@@ -240,9 +238,7 @@ def test_what_cannot_be_a_doppler_log_is_named(
         ("[30, 0, 0]", (1, 3**0.5 - 1.5, 1 + 1.5 * 3**0.5)),
     ],
 )
-def test_the_axes_of_a_driver_are_turned_into_ours(
-    foreign: Any, rotation: str, expected: tuple[float, ...]
-) -> None:
+def test_the_axes_of_a_driver_are_turned_into_ours(foreign, rotation, expected):
     toml = f"[dvl]\nrotation = {rotation}"
     sequence = foreign.read(imu(), dvl(velocity_covar=KNOWN), toml=toml)
     np.testing.assert_allclose(sequence.dvl.velocity, [expected] * 5, atol=1e-15)

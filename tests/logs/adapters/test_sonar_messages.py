@@ -98,8 +98,8 @@ CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     ("entry", "toml", "intensity", "azimuths_rad"), CASES.values(), ids=CASES
 )
 def test_images_are_beams_by_bins_however_they_come(
-    foreign: Any, entry: Entry, toml: str, intensity: Floats, azimuths_rad: Floats
-) -> None:
+    foreign, entry, toml, intensity, azimuths_rad
+):
     (frames,) = frames_in(foreign, entry, toml=toml)
     np.testing.assert_allclose(frames.intensity, [intensity])
     np.testing.assert_allclose(frames.azimuths_rad, azimuths_rad)
@@ -113,16 +113,16 @@ def test_images_are_beams_by_bins_however_they_come(
     ],
 )
 def test_an_image_that_does_not_fit_and_a_choice_that_is_open_are_named(
-    foreign: Any, entries: list[Entry], message: str
-) -> None:
+    foreign, entries, message
+):
     with pytest.raises(LogError, match=message):
         frames_in(foreign, *entries)
     assert len(entries) == 1 or len(frames_in(foreign, *entries, topic="/right")) == 1
 
 
 def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(
-    foreign: Any,
-) -> None:
+    foreign,
+):
     sound = inspect_log(foreign.write(pings(ping()))).sonar
     assert (
         sound == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
@@ -135,9 +135,7 @@ def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(
 
 
 @pytest.mark.recording
-def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
-    foreign: Any, recordings: Path
-) -> None:
+def test_a_real_oculus_ping_comes_out_as_its_own_header_says(foreign, recordings):
     raw = (recordings / "sonar" / "one_ping_8bit.raw").read_bytes()
     bearings = np.round(np.linspace(-3000, 3000, 256)).astype(int).tolist()
     sizes = {
@@ -171,8 +169,8 @@ def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
     ],
 )
 def test_messages_that_are_no_image_are_refused_by_their_time(
-    bad: list[int],
-) -> None:
+    bad,
+):
     """Several messages may share an instant, sound ones and others."""
     kind = "marine_acoustic_msgs/msg/ProjectedSonarImage"
     times_ns = np.array([10, 10, 20, 30, 30, 30])

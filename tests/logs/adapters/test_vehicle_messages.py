@@ -214,7 +214,7 @@ GRAVITY: dict[tuple[float, ...], str | None] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_measurements(foreign: Any, case: Case) -> None:
+def test_messages_of_any_driver_become_measurements(foreign, case):
     sequence = foreign.check(*case)
     assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
     if (
@@ -227,8 +227,8 @@ def test_messages_of_any_driver_become_measurements(foreign: Any, case: Case) ->
 
 @pytest.mark.parametrize(("force", "warning"), GRAVITY.items(), ids=str)
 def test_gravity_along_another_axis_is_reported_with_its_rotation(
-    foreign: Any, force: tuple[float, ...], warning: str | None
-) -> None:
+    foreign, force, warning
+):
     notes = foreign.check(
         [imu(force=force), dvl()], FRD_DVL, {}, {"log.doubtful": warning}
     ).notes
@@ -249,12 +249,12 @@ def test_gravity_along_another_axis_is_reported_with_its_rotation(
     ("toml", "recorded", "position", "expected"), AXES.values(), ids=AXES
 )
 def test_axes_of_world_and_body_become_ours(
-    foreign: Any,
-    toml: str,
-    recorded: Rotation,
-    position: list[float],
-    expected: Rotation,
-) -> None:
+    foreign,
+    toml,
+    recorded,
+    position,
+    expected,
+):
     truth = foreign.read(poses(recorded), toml=toml).truth
     np.testing.assert_array_equal(truth.positions, [position] * 3)
     np.testing.assert_allclose(
@@ -268,7 +268,7 @@ def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     return root @ root.transpose(0, 2, 1), Rotation.random(n, rng).as_matrix()
 
 
-def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
+def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes():
     covariances, rotations = random_covariances(1, 1)
     pose = gtsam.Pose3(gtsam.Rot3(rotations[0]), np.array([1.0, 2, 3]))
     samples = np.random.default_rng(2).multivariate_normal(
@@ -291,17 +291,13 @@ def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
 
 
 @pytest.mark.parametrize(("entry", "toml", "message"), REFUSED.values(), ids=REFUSED)
-def test_results_that_are_no_detections_are_refused(
-    foreign: Any, entry: Entry, toml: str, message: str
-) -> None:
+def test_results_that_are_no_detections_are_refused(foreign, entry, toml, message):
     with pytest.raises(LogError, match=message):
         foreign.read(entry, toml=toml)
 
 
 @given(st.tuples(*[st.floats(-10, 10)] * 3), st.integers(0, 1000))
-def test_the_covariance_is_that_of_many_samples_to_first_order(
-    position: tuple[float, ...], seed: int
-) -> None:
+def test_the_covariance_is_that_of_many_samples_to_first_order(position, seed):
     assume(np.hypot(*position[:2]) > 0.5)
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, 3)) * 1e-4
