@@ -177,13 +177,11 @@ def test_detections_are_padded_and_keep_their_tracks(
     np.testing.assert_array_equal(found.range_azimuth_cov[0], [[0.01, 0], [0, 0.02]])
     assert found.track.tolist() == [4, 3, -1, -1, 7]
     # logs older than tracks
-    lines = definition("sonar_graph_msgs/msg/LandmarkDetections").splitlines(
-        keepends=True
-    )
-    old = "".join(line for line in lines if "track" not in line)
-    frame = {key: value for key, value in frames[0].items() if key != "track"}
-    path = bench.write(*bench.basics(), ("/landmarks", "detections", [frame], old))
-    assert read_log(path).detections.track.tolist() == [-1, -1]  # type: ignore[union-attr]
+    text = definition("sonar_graph_msgs/msg/LandmarkDetections")
+    old = "".join(x for x in text.splitlines(keepends=True) if "track" not in x)
+    del frames[0]["track"]
+    path = bench.write(*bench.basics(), ("/landmarks", "detections", frames[:1], old))
+    assert read_log(path).detections.track.tolist() == [-1, -1]
 
 
 def one_of(bench: Bench, **changed: Any) -> Path:
@@ -238,10 +236,7 @@ TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
         "1 of 3 rows have an azimuth beyond a full turn in rad (up to 40)",
     ),
     "97 %": ({"id_probability": [97.0, 0.5]}, 2, POSTERIOR),
-    "negative": ({"id_probability": [0.5, -0.1]}, 2, POSTERIOR),
-    "above 1": ({"id_probability": [1.1, 0.5]}, 2, POSTERIOR),
     "range": ({"range_m": [-1.0, 2.0]}, 3, f"1 of 3 rows have {RANGE}"),
-    "far": ({"range_m": [1e10, 1e14]}, 3, f"2 of 3 rows have {RANGE}"),
     "no covariance": (
         {"covariance": [0.0] * 4 + [0.01, 0, 0, 0.02]},
         3,

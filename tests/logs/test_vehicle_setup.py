@@ -1,6 +1,5 @@
 """Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
 
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from sonar_graph.logs.mcap import Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import encode_mountings, gathered, mounting_of
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
+from sonar_graph.settings import flattened, nested
 
 TREE_M = (1.0, 2.0, 3.0)
 T0_NS = 1_700_000_000_000_000_000
@@ -149,33 +149,12 @@ FIELDS = {
 SOME = st.fixed_dictionaries({}, optional=FIELDS)
 
 
-def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    found = {}
-    for name, value in values.items():
-        found |= (
-            leaves(value, f"{prefix}{name}.")
-            if isinstance(value, dict)
-            else {prefix + name: value}
-        )
-    return found
-
-
-def nested(flat: dict[str, Any]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for path, value in flat.items():
-        *sections, name = path.split(".")
-        reduce(lambda at, section: at.setdefault(section, {}), sections, tree)[name] = (
-            value
-        )
-    return tree
-
-
 @given(SOME, SOME, st.sets(st.sampled_from(["imu", "dvl", "depth", "sonar"])))
 def test_every_field_comes_from_the_first_that_says_it(of_file, of_record, in_tree):
     recorded = Calibration.model_validate(nested(of_record))
     tree = {name: Mounting(translation_m=TREE_M, rpy_rad=(0, 0, 1)) for name in in_tree}
-    found = leaves(gathered(said(**nested(of_file)), recorded, tree).model_dump())
-    expected = leaves(Calibration().model_dump())
+    found = flattened(gathered(said(**nested(of_file)), recorded, tree).model_dump())
+    expected = flattened(Calibration().model_dump())
     for name in in_tree - {"depth"}:
         expected |= {
             f"{name}.mounting.translation_m": TREE_M,

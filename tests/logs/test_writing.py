@@ -19,7 +19,6 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from sonar_graph.errors import LogError
-from sonar_graph.files import written_whole
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log, sonar_image_messages, write_log
 from sonar_graph.logs.mcap import LogFile, recording, write_recording
@@ -216,25 +215,6 @@ def test_latched_topics_offer_transient_local_qos(
         assert "durability: 1," in metadata["/start"]["offered_qos_profiles"]
         records = {m.name: m.metadata for m in reader.iter_metadata()}
         assert records["rosbag2"] == {"serialized_metadata": ""}
-
-
-def test_a_file_has_its_name_only_when_it_is_whole(tmp_path):
-    def break_off(path: Path) -> None:
-        with written_whole(path) as stream:
-            stream.write(b"half")
-            raise ZeroDivisionError
-
-    path = tmp_path / "new folder" / "log.mcap"
-    with written_whole(path) as stream:
-        stream.write(b"all of it")
-        stream.flush()
-        assert not path.exists()
-    with pytest.raises(ZeroDivisionError):
-        break_off(path)
-    assert path.read_bytes() == b"all of it"
-    assert list(path.parent.iterdir()) == [path]
-    with pytest.raises(LogError, match=r"log\.mcap/a cannot be written: "):
-        break_off(path / "a")
 
 
 WRITER = """

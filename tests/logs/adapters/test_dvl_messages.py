@@ -229,23 +229,19 @@ def test_what_cannot_be_a_doppler_log_is_named(foreign, entry, toml, message):
 
 
 @pytest.mark.parametrize(
-    ("rotation", "expected"),
+    ("rotation", "R"),
     [
-        ('"flu"', (1, 2, 3)),
-        ('"frd"', (1, -2, -3)),
-        ("[180, 0, 0]", (1, -2, -3)),
-        ("[0, 0, 90]", (-2, 1, 3)),
-        ("[30, 0, 0]", (1, 3**0.5 - 1.5, 1 + 1.5 * 3**0.5)),
+        ('"flu"', np.eye(3)),
+        ('"frd"', np.diag([1, -1, -1])),
+        ("[180, 0, 0]", np.diag([1, -1, -1])),
+        ("[0, 0, 90]", [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+        ("[30, 0, 0]", Rotation.from_euler("x", 30, degrees=True).as_matrix()),
     ],
 )
-def test_the_axes_of_a_driver_are_turned_into_ours(foreign, rotation, expected):
+def test_the_axes_of_a_driver_are_turned_into_ours(foreign, rotation, R):
+    """A covariance is turned as the velocity is."""
     toml = f"[dvl]\nrotation = {rotation}"
     sequence = foreign.read(imu(), dvl(velocity_covar=KNOWN), toml=toml)
-    np.testing.assert_allclose(sequence.dvl.velocity, [expected] * 5, atol=1e-15)
-    # a covariance is turned as the velocity is: by the matrix that did it
-    units = [
-        foreign.read(imu(), dvl(velocity=vector(*unit)), toml=toml).dvl.velocity[0]
-        for unit in np.eye(3).tolist()
-    ]
-    R = np.column_stack(units)
+    R = np.array(R)
+    np.testing.assert_allclose(sequence.dvl.velocity, [R @ VELOCITY] * 5, atol=1e-15)
     np.testing.assert_allclose(sequence.dvl.velocity_cov[0], R @ COV @ R.T, atol=1e-15)

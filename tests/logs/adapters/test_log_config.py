@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import SHIPPED, read_log_config
+from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.logs.adapters.log_config import toml_value
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
@@ -47,11 +47,6 @@ def test_a_mistake_is_named_with_its_file_table_and_key(tmp_path, toml, message)
 def test_a_topic_that_cannot_be_is_refused(foreign, toml, message):
     with pytest.raises(MissingTopicError, match=message):
         foreign.read(toml=toml)
-
-
-SHIPPED_ADAPTERS = [
-    (role, offer.adapter) for role, offers in SHIPPED.items() for offer in offers
-]
 
 
 LEAVES = (
