@@ -308,8 +308,7 @@ class Assembly:
         self._notes |= {subject: text for subject, text in found.items() if text}
         self._notes |= recording.notes()
         self._missing: dict[str, str] = {}
-        self._unplaced: tuple[str, ...] = ()
-        self._has_tree = False
+        self._unplaced: list[str] = []
         self._is_start_stated = True
         is_described_ = is_described(recording)
         if isinstance(calibration, Calibration):
@@ -385,7 +384,6 @@ class Assembly:
                 mountings[name] = mounting
         mounted = mountings.keys() | by_hand
         self._missing = {k: frame for k, frame in frames.items() if k not in mounted}
-        self._has_tree = bool(tree)
         source = "from the log"
         if not is_recorded:
             source = f"{', '.join(sorted(stated))} {source}; else defaults"
@@ -397,7 +395,11 @@ class Assembly:
                 source += f"; not in the tree, taken as base_link: {left}"
         self._notes["log.calibration"] = given.before(source) if given else source
         # a record of this package states what is not zero
-        self._unplaced = () if recorded else tuple(self._missing)
+        if recorded is None:
+            self._unplaced = [
+                unplaced(*missing, has_tree=bool(tree))
+                for missing in self._missing.items()
+            ]
         self.calibration = gathered(given, recorded, mountings)
 
     @property
@@ -418,8 +420,7 @@ class Assembly:
             rows, dropped = adapter.read(self._tables[role], self.setup(role))
         if rows is not None and not self._is_live:
             is_wrong, reason, advice = self._contradicted(role, rows)
-            count = int(np.count_nonzero(is_wrong))
-            if count:
+            if count := int(np.count_nonzero(is_wrong)):
                 text = f"{count} of {len(rows)} rows {reason}: left out{advice}"
                 self._left_out[role] = text
                 dropped = dropped | {reason: count}
@@ -434,16 +435,10 @@ class Assembly:
         none = np.zeros(len(rows), bool)
         imu = self.block("imu") if role != "imu" else None
         if role == "dvl" and imu is not None and self._may_lack_lock:
-            unfelt = (
-                none
-                if rows.velocity.any(axis=1).all()
-                else unfelt_zeros(imu, rows, self.calibration)
-            )
-            advice = "`are_zeros_measured = true` under [dvl] in a log configuration uses them"
-            return unfelt, UNFELT, f"; {advice}"
-        if role not in LEAST_MOVED or imu is None or len(rows) < 2:
-            return none, "", ""
-        dvl = self.block("dvl")
+            advice = "; `are_zeros_measured = true` under [dvl] in a log configuration uses them"
+            return unfelt_zeros(imu, rows, self.calibration), UNFELT, advice
+        may_be_stuck = role in LEAST_MOVED and imu is not None and len(rows) > 1
+        dvl = self.block("dvl") if may_be_stuck else None
         if dvl is None:
             return none, "", ""
         # a sensor is stuck where it repeats its value while the vehicle moves
@@ -568,8 +563,7 @@ class Assembly:
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
-        for role in self._unplaced:
-            yield unplaced(role, self._missing[role], has_tree=self._has_tree)
+        yield from self._unplaced
         for role, table in self._tables.items():
             for text in self.adapters[role].warnings(table):
                 yield f"{role}: {text}"

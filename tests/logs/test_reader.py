@@ -19,7 +19,8 @@ from mcap.writer import CompressionType, IndexType
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs import read_log
-from sonar_graph.logs.mcap import Damage, Instant, Keep, TimeWindow, scan, seal, stream
+from sonar_graph.logs.mcap import Damage, Instant, Keep, TimeWindow, scan, stream
+from sonar_graph.logs.mcap.log_file import seal
 
 from .conftest import (
     Stored,

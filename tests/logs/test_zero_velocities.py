@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from sonar_graph import Calibration, Dvl, Imu, Sequence
-from sonar_graph.logs import read_log, row_notes, unfelt_zeros, write_log
+from sonar_graph.logs import read_log, row_notes, write_log
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.checks import unfelt_zeros
 from sonar_graph.measurements import Floats
 
 from .conftest import copy, recorded, writing

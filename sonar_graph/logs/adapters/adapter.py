@@ -21,7 +21,7 @@ from pydantic import (
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.logs.adapters.geodesy import Origin
+from sonar_graph.logs.adapters.geodesy import Origin, turned
 from sonar_graph.logs.adapters.message_table import (
     SAME_STAMP,
     FieldTable,
@@ -70,11 +70,6 @@ def axes_matrix(rotation: Rotation) -> Floats:
 def turn(rotation: Rotation, vectors: Floats) -> Floats:
     """Vectors along the axes of this package, shape (n, 3); those that need no rotation keep every bit."""
     return vectors if rotation == "flu" else turned(axes_matrix(rotation), vectors)
-
-
-def turned(R: Floats, vectors: Floats) -> Floats:
-    """Product of a matrix with each vector, shape (n, 3), whose bits do not depend on the other vectors."""
-    return (R @ vectors[:, :, None])[:, :, 0]
 
 
 def turn_covariances(rotation: Rotation, covariances: Floats) -> Floats:

@@ -22,10 +22,9 @@ from sonar_graph.logs.adapters.adapter import (
     PathSection,
     Setup,
     axes_matrix,
-    turned,
     variances,
 )
-from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
+from sonar_graph.logs.adapters.geodesy import Origin, east_north_up, turned
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     FieldTable,

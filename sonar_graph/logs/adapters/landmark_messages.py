@@ -21,9 +21,9 @@ from sonar_graph.logs.adapters.adapter import (
     Setup,
     turn,
     turn_covariances,
-    turned,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R, World
+from sonar_graph.logs.adapters.geodesy import turned
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     FieldTable,

@@ -4,7 +4,7 @@
 from sonar_graph.logs.mcap.bag_folder import earlier_parts, log_parts
 from sonar_graph.logs.mcap.chunks import Found
 from sonar_graph.logs.mcap.foreign_files import ALREADY_MCAP, START_BYTES, foreign_kind, why_no_bag
-from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile, parse, seal
+from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile, parse
 from sonar_graph.logs.mcap.reader import ChunkPart, Passage, Progress, Recording
 from sonar_graph.logs.mcap.record_walk import Record, content_of
 from sonar_graph.logs.mcap.scanning import scan, stream
@@ -19,6 +19,6 @@ __all__ = [
     "ALREADY_MCAP", "ChunkPart", "Damage", "Found", "Instant", "Keep", "LARGEST_BYTES", "LARGEST_RATIO",
     "LogFile", "LogWriter", "Outgoing", "Passage", "Progress", "Record", "Recording", "STAMP_BYTES", "START_BYTES",
     "SchemaText", "TimeWindow", "Topic", "by_time", "content_of", "earlier_parts", "foreign_kind", "header_of", "is_own_log",
-    "keeping", "latched", "log_parts", "own_schema", "parse", "recording", "scan", "seal", "stream", "why_no_bag",
+    "keeping", "latched", "log_parts", "own_schema", "parse", "recording", "scan", "stream", "why_no_bag",
     "write_recording",
 ]
