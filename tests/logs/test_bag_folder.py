@@ -1,5 +1,6 @@
 """A folder of MCAP files, as ``ros2 bag record`` splits a recording, is the log that one file would be."""
 
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -137,7 +138,7 @@ def test_a_missing_part_is_an_error_unless_salvaged(folder, fault):
 def test_a_last_part_that_is_cut_off_is_read_as_far_as_it_goes(folder):
     cut(folder / NAMES[-1])
     found = read_log(folder)
-    assert "cut off" in found.notes["log.ending"]
+    assert re.search(r"cut off.* spans 1[89]\.\d* s", found.notes["log.ending"])
     assert "log.damage" not in found.notes
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sonar_graph as sg
-from sonar_graph.calibration import Start
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.errors import (
     CalibrationError,
     LogError,
@@ -340,12 +340,14 @@ LATER = TimeWindow(Instant.parse("2"))
         (None, LATER, True),
         ({"gravity_m_s2": 9.8}, LATER, True),
         ({"start": {"position_m": [1.0, 0.0, 0.0]}}, LATER, False),
+        (Calibration(), LATER, False),
         (None, TimeWindow(end=Instant.parse("2")), False),
         (None, TimeWindow(Instant.parse("0")), False),
     ],
 )
 def test_a_start_pose_of_another_instant_is_noted(long, stated, window, is_told):
-    given = PartialCalibration.parse(stated, "x.toml") if stated else None
+    is_part = isinstance(stated, dict)
+    given = PartialCalibration.parse(stated, "x.toml") if is_part else stated
     notes = read_log(long[1], window=window, calibration=given).notes
     assert ("log.start_pose" in notes) == is_told
     pattern = r"of its beginning, 2\.000 s before .*\[start\] position_m and rpy_rad .*--calibration"

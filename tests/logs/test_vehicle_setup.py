@@ -96,6 +96,7 @@ NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsa
         "dvl", {"base_link": ("base_footprint", BELOW), "dvl": ("base_link", STEP)}, STEP),
     "a footprint that carries both": (
         "dvl", {"base_link": ("base_footprint", BELOW), "dvl": ("base_footprint", STEP)}, BELOW.inverse() * STEP),
+    "a frame in between": ("dvl", {"dvl": ("arm", STEP), "arm": ("base_link", BELOW)}, BELOW * STEP),
     "two vehicles": (
         "b/dvl", {"a/dvl": ("a/base_link", BELOW), "b/dvl": ("b/base_link", STEP)}, STEP),
     "a faulty transform above the body": (

@@ -153,6 +153,9 @@ CASES: dict[str, Case] = {
     "twist of odometry without a child, in the frame of the header": (
         [twists("/dvl/odom", "nav_msgs/msg/Odometry"), tree("dvl_link", (0.5, 0, 0), z=1.0)], "",
         {"calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
+    "velocities that are no numbers": (
+        [twists("/dvl/twist"), packets([(1.0, np.inf, 3.0, 0.0), (1.0, 2.0, 3.0, 0.0)])], f'{OF_ARRAY}stamp = "log"',
+        {"dvl.velocity": [VELOCITY]}, {"log.dropped": "dvl: 1 with values that are not finite"}),
     # units and meanings
     "millimetres": (
         [dvl(velocity=vector(1e3, 2e3, 3e3), velocity_covar=(np.array(KNOWN) * 1e6).tolist())], "[dvl]\nscale = 0.001",
