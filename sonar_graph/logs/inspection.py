@@ -38,6 +38,7 @@ from sonar_graph.logs.mcap import (
 )
 from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import (
+    NAVIGATION,
     ROLES,
     SEQUENCE_ROLES,
     SONAR,
@@ -104,18 +105,6 @@ class TopicSummary:
 
 
 @dataclass(frozen=True)
-class RoleSummary:
-    """The topic that plays a role."""
-
-    role: str
-    topic: str | None
-    """None: no topic plays it, or several could."""
-    reason: str
-    candidates: tuple[str, ...] = ()
-    """The topics that fit, where they are several."""
-
-
-@dataclass(frozen=True)
 class LogSummary:
     """Content of a log, and its faults.
 
@@ -133,7 +122,7 @@ class LogSummary:
     name: str | None
     """Name in the log's record."""
     topics: tuple[TopicSummary, ...]
-    roles: tuple[RoleSummary, ...]
+    roles: tuple[Choice, ...]
     calibration: str
     """Source of the calibration, or the reason why the one in the log cannot be used; empty where `unusable` names it."""
     notes: dict[str, str]
@@ -156,17 +145,15 @@ class LogSummary:
     def obstacles(self) -> tuple[str, ...]:
         """Needed roles that no topic plays, or several could, so that no estimator can run; such as ``no IMU``."""
         found = []
-        for role in self.roles:
-            count = len(role.candidates)
-            if role.topic is not None or not ROLES[role.role].is_required:
+        for choice in self.roles:
+            role = choice.role
+            if choice.topic is not None or role not in NAVIGATION:
                 continue
-            if count:
-                choice = f"{role.role}={role.candidates[0]}"
-                found.append(
-                    f"{count} topics for {role.role} (choose: --topic {choice})"
-                )
+            if count := len(choice.candidates):
+                advice = f"--topic {role}={choice.candidates[0]}"
+                found.append(f"{count} topics for {role} (choose: {advice})")
             else:
-                found.append(f"no {role.role.upper()}")
+                found.append(f"no {role.upper()}")
         return tuple(found)
 
     @property
@@ -291,10 +278,7 @@ def inspect_log(
         path=recording.path,
         name=recorded_name(recording),
         topics=summaries,
-        roles=tuple(
-            RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
-            for c in choices.values()
-        ),
+        roles=tuple(choices.values()),
         calibration=calibrated,
         notes=notes,
         damage=tuple(damage),
@@ -379,7 +363,7 @@ def starting_config(
         f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."
     ]
     for choice in choices:
-        role = choice.role.name
+        role = choice.role
         table = config.table(role)
         named = choice.candidates or choice.could_be
         if choice.topic is not None and choice.adapter is not None:
@@ -392,12 +376,12 @@ def starting_config(
         elif named:
             topics = (f'topic = "{name}"' for name in named)
             parts.append(_comment(f"[{role}]  # one of", *topics))
-        elif choice.role.is_required:
+        elif role in NAVIGATION:
             parts.append(_comment(*_to_fill_in(role, recording)))
         else:
             parts.append(_comment(f"[{role}]  # nothing found"))
     used = {choice.topic for choice in choices}
-    if any(choice.topic is None and choice.role.is_required for choice in choices):
+    if any(choice.topic is None and choice.role in NAVIGATION for choice in choices):
         for topic in recording.topics.values():
             if topic.name in used or not topic.is_ros2 or topic.is_a(TF):
                 continue

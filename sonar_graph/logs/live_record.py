@@ -28,7 +28,7 @@ from sonar_graph.logs.mcap import (
     latched,
     own_schema,
 )
-from sonar_graph.logs.roles import DROPPED, TF, Choice
+from sonar_graph.logs.roles import DROPPED, NAVIGATION, TF, Choice
 from sonar_graph.logs.vehicle_setup import (
     METADATA,
     read_notes,
@@ -112,7 +112,7 @@ def pinned(
             tables[role] = {"use": False}
         else:
             tables.setdefault(role, {})["topic"] = choice.topic
-    for role in ("imu", "dvl"):
+    for role in NAVIGATION:
         adapter = assembly.adapters[role]
         # single messages must be read as all of the log are
         tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))

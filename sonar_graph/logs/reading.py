@@ -59,7 +59,7 @@ from sonar_graph.logs.mcap import (
     scan,
 )
 from sonar_graph.logs.roles import (
-    ROLES,
+    NAVIGATION,
     SEQUENCE_ROLES,
     SONAR,
     Choice,
@@ -332,7 +332,7 @@ class Assembly:
         try:
             self._tables[role] = self.adapters[role].table(topic)
         except LogError:
-            if len(topic) or ROLES[role].is_required:
+            if len(topic) or role in NAVIGATION:
                 raise
             self._dropped[role] = topic.unsound
 
@@ -487,7 +487,7 @@ class Assembly:
         Raises LogError when IMU and DVL are not enough for any estimator, or a message breaks its own rules.
         """
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
-        for role in ("imu", "dvl"):
+        for role in NAVIGATION:
             if blocks[role] is None:
                 raise self._useless(role)
         imu = blocks["imu"]
@@ -555,7 +555,7 @@ class Assembly:
             dvl = self.block("dvl")
             depth = self.block("depth")
             yield from row_doubts(imu, dvl, depth, self.calibration)
-        for role in ("imu", "dvl"):
+        for role in NAVIGATION:
             if (table := self._tables.get(role)) is not None:
                 times_ns = table.topic.log_times_ns
                 for text in stamp_doubts(table.stamps_ns, times_ns):

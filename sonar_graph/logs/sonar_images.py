@@ -25,6 +25,7 @@ from sonar_graph.logs.mcap import (
     stream,
 )
 from sonar_graph.logs.roles import (
+    NAVIGATION,
     SONAR,
     Window,
     as_window,
@@ -42,10 +43,6 @@ from sonar_graph.logs.vehicle_setup import (
     static_mounting,
     with_fields,
 )
-
-NAVIGATION = ("imu", "dvl")
-"""Roles without which nothing is known of the motion but what images show."""
-
 
 OF_THE_IMAGES = ("image", "lens", "elevation_aperture_rad")
 """Fields of a sonar's calibration that a recording of images knows better than a log without."""
@@ -176,8 +173,8 @@ def joined_calibration(
     What the user gives goes before both. The sonar's mounting is that of the navigation's record or ``/tf_static``, or
     else that of the images'; without either it stays unstated. ``topic`` is that of the images.
     """
-    known = recorded_fields(navigation)
-    own = recorded_fields(images).get(SONAR, {})
+    known = recorded_fields(navigation) or {}
+    own = (recorded_fields(images) or {}).get(SONAR, {})
     # the sonar's own recording has its lens and scale
     better = {name: own[name] for name in OF_THE_IMAGES if name in own}
     frame = sonar_frame(scan(images), topic)

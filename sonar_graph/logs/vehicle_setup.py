@@ -238,14 +238,14 @@ class PartialCalibration:
         """
         if path.suffix == ".mcap":
             try:
-                recorded = read_calibration(scan(path))
+                recorded = recorded_fields(path)
             except LogError as error:
                 raise CalibrationError(str(error)) from error
             if recorded is None:
                 raise CalibrationError(
                     f"{path}: the log has no calibration; give one that was written by sonar-graph"
                 )
-            return cls(recorded.model_dump(mode="json", exclude_unset=True), str(path))
+            return cls(recorded, str(path))
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
             text = text_of(path)
@@ -323,12 +323,10 @@ def recorded_calibration(calibration: Calibration) -> str:
     return calibration.model_dump_json(exclude=exclude)
 
 
-def recorded_fields(path: Path) -> dict[str, Any]:
-    """Fields of a calibration that a log's record states, as JSON has them."""
+def recorded_fields(path: Path) -> dict[str, Any] | None:
+    """Fields of a calibration that a log's record states, as JSON has them; None without one."""
     recorded = read_calibration(scan(path))
-    return (
-        {} if recorded is None else recorded.model_dump(mode="json", exclude_unset=True)
-    )
+    return recorded and recorded.model_dump(mode="json", exclude_unset=True)
 
 
 def static_mounting(path: Path, frame: str) -> Mounting | None:

@@ -261,9 +261,7 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
 def choices(path: Path, config: LogConfig) -> dict[str, object]:
     """For each role the topic, others that fit, and the adapter but for the topic that the text names."""
     recording = scan(path, lambda _: Keep.STAMP)
-    found = {
-        name: choose_topic(role, recording, config) for name, role in ROLES.items()
-    }
+    found = {name: choose_topic(name, recording, config) for name in ROLES}
     adapters = {
         name: c.adapter and c.adapter.model_copy(update={"topic": None})
         for name, c in found.items()

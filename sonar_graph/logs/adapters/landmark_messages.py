@@ -9,7 +9,7 @@ Impossible identities are refused, impossible rows are left out, and unlikely on
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -60,7 +60,7 @@ class _Rows(NamedTuple):
     """Shape (n, k)."""
     probabilities: Floats
     """Shape (n, k)."""
-    values: tuple[Floats, ...]
+    values: tuple[Any, ...]
     """Columns that do not depend on the candidates."""
 
 

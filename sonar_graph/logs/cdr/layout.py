@@ -2,8 +2,8 @@
 
 The place of a field depends only on the type and on the lengths of the strings and sequences before it. A `Plan` is the
 type as steps: neighbouring values of fixed number are one step, whatever types they are nested in; each string, each
-sequence, and each array of strings or types is another. A `PayloadWalk` takes the steps once, with lengths read from a
-payload or given, and notes where each begins. The `Layout` that results holds for all payloads with the same lengths.
+sequence, and each array of strings or types is another. A `Layout` takes the steps once, with lengths read from a
+payload or given, and notes where each begins. It holds for all payloads with the same lengths.
 
 Encoding is plain CDR (XCDR1, OMG DDS-XTypes 1.3, 7.4.1): a four-byte encapsulation header, then primitives aligned to
 their own size counted from after that header; a string is its length with the closing NUL as uint32 and its bytes; a
@@ -16,6 +16,7 @@ Other messages are left out and counted by their fault.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -39,28 +40,8 @@ def padding(at: int, size: int) -> int:
     return -(at - HEADER_BYTES) % size
 
 
-class PayloadWalk:
-    """Places of the parts of a payload, noted while the steps of a plan are taken."""
-
-    def __init__(
-        self,
-        length_of: Callable[[DecodingStep, int], int],
-        most_elements: int | None,
-    ) -> None:
-        self.found: dict[DecodingStep, list[int]] = defaultdict(list)
-        """By step: the start of each block; for other steps start and count in turn."""
-        self.words: list[tuple[int, int]] = []
-        """Byte offset and value of each length word."""
-        self.end = HEADER_BYTES
-        self.most_elements = most_elements
-        self._length_of = length_of
-
-    def length(self, step: DecodingStep, at: int) -> tuple[int, int]:
-        """Byte after a step's length word, and the value of the word."""
-        at += -at % LENGTH_BYTES  # as much as after the header, which is as long
-        count = self._length_of(step, at)
-        self.words.append((at, count))
-        return at + LENGTH_BYTES, count
+LengthOf = Callable[["DecodingStep", int], int]
+"""Value of the length word of a step at a byte offset."""
 
 
 class DecodingStep(ABC):
@@ -72,7 +53,7 @@ class DecodingStep(ABC):
         self.path = path
 
     @abstractmethod
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the place of the part at byte ``at``; returns the byte after it."""
 
 
@@ -106,9 +87,9 @@ class FieldBlock(DecodingStep):
                 at += size * value.number
             self._sizes[phase] = at - start
 
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:  # noqa: ARG002  # of all steps
         """Note the start of the block, before any padding."""
-        walk.found[self].append(at)
+        layout.found[self].append(at)
         return at + self._sizes[at % _PHASES]
 
 
@@ -120,13 +101,13 @@ class Counted(DecodingStep):
         self.is_text = is_text
         self._size = np.dtype(kind).itemsize
 
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the place of the first value and their count; the NUL that closes a string is one."""
-        at, count = walk.length(self, at)
+        at, count = layout.counted(self, at, length_of)
         # numbers are aligned where there is one
         if count:
             at += padding(at, self._size)
-        walk.found[self] += (at, count)
+        layout.found[self] += (at, count)
         return at + count * self._size
 
 
@@ -138,17 +119,21 @@ class Repeated(DecodingStep):
         self._count = count
         self._steps = steps
 
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the start and count of the elements, and walk through them."""
         # a fixed array has no length word
-        at, count = walk.length(self, at) if self._count is None else (at, self._count)
-        walk.found[self] += (at, count)
-        if walk.most_elements is not None and count > walk.most_elements:
+        at, count = (
+            layout.counted(self, at, length_of)
+            if self._count is None
+            else (at, self._count)
+        )
+        layout.found[self] += (at, count)
+        if count > layout.most_elements:
             # every element has a byte at least, so this is beyond the end
             return at + count
         for _ in range(count):
             for step in self._steps:
-                at = step.take(at, walk)
+                at = step.take(at, layout, length_of)
         return at
 
 
@@ -171,23 +156,9 @@ class Plan:
         """Leaves by path, such as ``header.stamp.sec``; all elements of a sequence share one path."""
         self.sequences: dict[str, DecodingStep] = {}
         """Arrays and sequences by path, without arrays of numbers."""
-        self._steps = self._compile(definition, "", is_single=True)
+        self.steps = self._compile(definition, "", is_single=True)
         self.texts = [path for path, leaf in self.leaves.items() if leaf.step.is_text]
         self.booleans = [path for path, leaf in self.leaves.items() if leaf.kind == "?"]
-
-    def walk(
-        self,
-        length_of: Callable[[DecodingStep, int], int],
-        most_elements: int | None = None,
-    ) -> PayloadWalk:
-        """Take all steps; ``length_of`` gives the length word of a step at a byte offset.
-
-        An array of more than ``most_elements`` would reach beyond the end of the payload.
-        """
-        walk = PayloadWalk(length_of, most_elements)
-        for step in self._steps:
-            walk.end = step.take(walk.end, walk)
-        return walk
 
     def _compile(
         self, definition: Struct, prefix: str, *, is_single: bool
@@ -279,15 +250,36 @@ class PayloadColumn(NamedTuple):
 class Layout:
     """Places of all fields in payloads with the same lengths of strings and sequences."""
 
-    def __init__(self, plan: Plan, byte_order: str, walk: PayloadWalk) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        byte_order: str,
+        length_of: LengthOf,
+        most_elements: float = math.inf,
+    ) -> None:
         self.columns = plan.leaves
         """Fields that hold values by path, such as ``header.stamp.sec``."""
         self.byte_order = byte_order
-        self.size = walk.end
-        self.words = walk.words
         self.plan = plan
-        self._found = walk.found
+        self.found: dict[DecodingStep, list[int]] = defaultdict(list)
+        """By step: the start of each block; for other steps start and count in turn."""
+        self.words: list[tuple[int, int]] = []
+        """Byte offset and value of each length word."""
+        self.most_elements = most_elements
+        """An array of more would reach beyond the end of the payload."""
         self._places: dict[str, PayloadColumn] = {}
+        self.size = HEADER_BYTES
+        for step in plan.steps:
+            self.size = step.take(self.size, self, length_of)
+
+    def counted(
+        self, step: DecodingStep, at: int, length_of: LengthOf
+    ) -> tuple[int, int]:
+        """Byte after a step's length word, and the value of the word."""
+        at += -at % LENGTH_BYTES  # as much as after the header, which is as long
+        count = length_of(step, at)
+        self.words.append((at, count))
+        return at + LENGTH_BYTES, count
 
     def column(self, path: str) -> PayloadColumn:
         """Places of the values of a field; a KeyError where the type has no such field with values of its own."""
@@ -299,7 +291,7 @@ class Layout:
     def _place(self, path: str) -> PayloadColumn:
         step, kind, is_single = self.columns[path]
         dtype = np.dtype(self.byte_order + kind)
-        found = self._found[step]
+        found = self.found[step]
         if not isinstance(step, FieldBlock):
             return PayloadColumn(dtype, is_single, found[::2], found[1::2])
         offsets = step.offsets[path]
@@ -311,7 +303,7 @@ class Layout:
         """Number of elements of an array or sequence, one each time it occurs."""
         if path not in self.plan.sequences:
             return self.column(path).counts
-        return self._found[self.plan.sequences[path]][1::2]
+        return self.found[self.plan.sequences[path]][1::2]
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
@@ -365,13 +357,13 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
             raise UnsoundMessageError(f"with a length of {step.path} beyond their end")
         return length
 
-    walk = plan.walk(read_length, most_elements=size)
-    if walk.end > size:
+    layout = Layout(plan, order, read_length, size)
+    if layout.size > size:
         raise UnsoundMessageError("that end before their definition does")
     # a definition that is too short would read as sound
-    if walk.end < size - MOST_PADDING:
+    if layout.size < size - MOST_PADDING:
         raise UnsoundMessageError("that are longer than their definition says")
-    return Layout(plan, order, walk)
+    return layout
 
 
 def unsound_contents(
