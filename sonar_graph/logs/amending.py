@@ -206,7 +206,7 @@ class _AmendedCopy:
         if wanted is not None:
             self.amended.replaced[topic.name] += len(found.sizes)
             return None
-        channel, schema = passage.as_written[topic.name]
+        channel, schema = passage.described.as_written[topic.name]
         text = SchemaText(schema.name, schema.encoding, schema.data)
         return self.writer.channel(topic.name, text, topic.encoding, channel.metadata)
 

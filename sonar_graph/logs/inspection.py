@@ -339,20 +339,19 @@ def _header_stamps(topic: Topic) -> Ints | None:
     is_header = isinstance(kind, Struct) and kind.name == "std_msgs/Header"
     if not is_header or min(topic.stacks, default=0) < STAMP_BYTES:
         return None
-    parts = [
-        (rows, payloads[:, :STAMP_BYTES])
-        for stack in topic.stacks.values()
-        for rows, payloads in stack
-    ]
-    decoded = decode(parse_definition(TIME), parts)
-    if decoded.unsound:
-        return None
+    decoded = decode(
+        parse_definition(TIME),
+        [
+            (rows, payloads[:, :STAMP_BYTES])
+            for stack in topic.stacks.values()
+            for rows, payloads in stack
+        ],
+    )
     stamps_ns = np.empty(len(topic), np.int64)
     for group in decoded.groups:
-        stamps_ns[group.rows] = (
-            group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
-        )
-    return stamps_ns
+        seconds = group["sec"].astype(np.int64)
+        stamps_ns[group.rows] = seconds * NS_PER_S + group["nanosec"]
+    return None if decoded.unsound else stamps_ns
 
 
 def starting_config(

@@ -11,7 +11,6 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -58,9 +57,8 @@ def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
             group.strings("reason"),
             strict=True,
         )
-        found |= {
-            (name, log_time_ns): reason for (name,), log_time_ns, (reason,) in columns
-        }
+        for (name,), log_time_ns, (reason,) in columns:
+            found[name, log_time_ns] = reason
     return found
 
 
@@ -149,17 +147,11 @@ class LiveRecord:
         self._writer = LogWriter(self._stream)
         self._channels: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
-        self._of_dropped = parse_definition(DROPPED)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._writer.finish()
         self._stream.close()
 
@@ -224,9 +216,8 @@ class LiveRecord:
             "log_time": log_time_ns,
             "reason": reason,
         }
-        self.write(
-            DROPPED_TOPIC, encode(self._of_dropped, 1, values)[0].tobytes(), arrival_ns
-        )
+        payload = encode(parse_definition(DROPPED), 1, values)[0].tobytes()
+        self.write(DROPPED_TOPIC, payload, arrival_ns)
 
     def flush(self) -> None:
         """Give all that was written to the operating system, where the end of this process loses nothing of it."""

@@ -116,14 +116,16 @@ class SonarAdapter(Adapter):
         ]
         if not blocks:
             return
-        rows = np.concatenate([images.rows for images in blocks])
-        counts = [len(images.rows) for images in blocks]
-        block = np.repeat(np.arange(len(blocks)), counts)
-        within = np.concatenate([np.arange(count) for count in counts])
-        order = np.argsort(rows)
-        is_other = np.diff(block[order]) != 0
-        is_earlier = np.diff(table.stamps_ns[rows[order]]) < 0
-        for run in np.split(order, np.flatnonzero(is_other | is_earlier) + 1):
+        # of each message its number in the topic, its block and its place there
+        columns = [
+            np.column_stack([b.rows, np.full(len(b.rows), k), np.arange(len(b.rows))])
+            for k, b in enumerate(blocks)
+        ]
+        places = np.concatenate(columns)
+        rows, block, within = places[np.argsort(places[:, 0])].T
+        is_end = (np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0)
+        ends = np.flatnonzero(is_end) + 1
+        for run in np.split(np.arange(len(rows)), ends):
             images = blocks[block[run[0]]]
             is_whole = len(run) == len(images.rows)  # then without a copy
             samples = images.samples if is_whole else images.samples[within[run]]
@@ -135,11 +137,9 @@ class SonarAdapter(Adapter):
     ) -> Iterator[_Images]:
         """Images of messages of one layout, apart where beams, bins or samples differ."""
         count = len(group)
-        flags = [
-            np.full(count, -1) if path is None else group[path].astype(np.int64)
-            for path in (getattr(self, name) for name in KINDS)
-        ]
-        kinds = np.column_stack(flags)
+        paths = [getattr(self, name) for name in KINDS]
+        flags = [group[path] if path else np.full(count, -1) for path in paths]
+        kinds = np.column_stack(flags).astype(np.int64)
         bins = group[str(self.ranges or self.range_resolution)]
         bins_m = np.asarray(bins, float).reshape(count, -1)
         if self.directions is not None:

@@ -103,8 +103,8 @@ def _join(whole: Recording, file: LogFile, passage: Passage) -> None:
     counts = passage.counts
     # where chunks are skipped or left out, not every message that can be read was counted
     is_complete = not passage.skipped and passage.limits is None
-    settle(passage.damage, passage.topics, counts if is_complete else None)
-    for name, topic in passage.topics.items():
+    settle(passage.damage, passage.described.by_name, counts if is_complete else None)
+    for name, topic in passage.described.by_name.items():
         # topics that are only counted are listed, although their chunks were skipped
         is_in_skipped = topic.keep is Keep.NONE and bool((counts or {}).get(name))
         if not len(topic) and not is_in_skipped:
