@@ -13,6 +13,7 @@ from mcap.records import Channel, ChunkIndex, Message, Schema
 from mcap.writer import Writer as ContainerWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.logs.cdr import definition
@@ -53,6 +54,10 @@ def vector(x: float, y: float, z: float) -> dict[str, float]:
     return {"x": x, "y": y, "z": z}
 
 
+def quaternion(rotation: Rotation) -> dict[str, float]:
+    return dict(zip("xyzw", rotation.as_quat().tolist(), strict=True))
+
+
 class Bench:
     """Builds logs message by message with mcap-ros2-support."""
 
@@ -90,10 +95,8 @@ class Bench:
         }
 
     def odometry(self, ns: int, x: float, **other: Any) -> dict[str, Any]:
-        pose = {
-            "position": vector(x, 0, 0),
-            "orientation": {**vector(0, 0, 0), "w": 1.0},
-        }
+        turn = quaternion(Rotation.identity())
+        pose = {"position": vector(x, 0, 0), "orientation": turn}
         return {"header": header(ns, "map"), "pose": {"pose": pose}} | other
 
     def detections(
@@ -114,8 +117,8 @@ class Bench:
     def transform(
         self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0
     ) -> dict[str, Any]:
-        rotation = {**vector(0, 0, np.sin(yaw_rad / 2)), "w": np.cos(yaw_rad / 2)}
-        moved = {"translation": vector(*xyz), "rotation": rotation}
+        turn = quaternion(Rotation.from_euler("z", yaw_rad))
+        moved = {"translation": vector(*xyz), "rotation": turn}
         return {
             "header": header(0, parent),
             "child_frame_id": child,

@@ -42,7 +42,7 @@ BLOCKS = (
 )
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 2**31),
     samples=st.integers(1, 40),

@@ -1,5 +1,6 @@
 """Headings, position fixes and true positions of any driver: units, axes, mountings, origins, and doubts about them."""
 
+import re
 from operator import attrgetter
 from typing import Any
 
@@ -11,6 +12,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.aiding_messages import is_unwrapped
 from sonar_graph.measurements import UNMEASURED_M2
+from tests.logs.conftest import quaternion
 
 from .conftest import (
     DEFINITIONS,
@@ -49,10 +51,12 @@ def oriented(
     rotation: Rotation, variance: float = 0.01, first: float = 0.01, topic: str = "/imu"
 ) -> Entry:
     """IMU messages with an orientation and the first and last variance of it."""
-    x, y, z, w = rotation.as_quat().tolist()
-    said = {"orientation": {"x": x, "y": y, "z": z, "w": w}}
-    said |= {"orientation_covariance": [first, 0, 0, 0, 0.01, 0, 0, 0, variance]}
-    rows = [{"linear_acceleration": vector(0, 0, 9.8), **said}] * 2
+    row = {
+        "linear_acceleration": vector(0, 0, 9.8),
+        "orientation": quaternion(rotation),
+        "orientation_covariance": [first, 0, 0, 0, 0.01, 0, 0, 0, variance],
+    }
+    rows = [row] * 2
     return rows_of(topic, IMU, rows, "imu_link", angular_velocity=vector(0, 0, 0))
 
 
@@ -115,7 +119,7 @@ CASES: dict[str, Case] = {
         [oriented(YAW), dvl()], "[imu]\nstamp_offset_s = 0.05",
         {"heading.stamps_ns": 1_700_000_000_050_000_000 + np.array([0, 100_000_000])}, {}),
     "quaternion of a heading by name": (
-        [rows_of("/gps/heading", TURNED, [{"quaternion": {"z": np.sin(0.25), "w": np.cos(0.25)}}] * 3)], "",
+        [rows_of("/gps/heading", TURNED, [{"quaternion": quaternion(YAW)}] * 3)], "",
         {"heading.yaw_rad": [0.5] * 3}, {}),
     "bearing in degrees": (
         [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 90.0, 350.0)])],
@@ -217,21 +221,13 @@ def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(
     assert len(foreign.read(truth, topics={"positions": "/truth/fix"}).positions) == 2
     odometry = rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", [{}] * 2)
     summary = inspect_log(foreign.write(imu(), odometry))
-    assert [
-        role.reason
-        for role in summary.roles
-        if role.role == "dvl" and "ground_truth" in role.reason
-    ] == []
-    assert (
-        "/ground_truth/odometry"
-        not in summary.toml.partition("[dvl]")[2].partition("[depth]")[0]
-    )
+    reasons = {role.role: role.reason for role in summary.roles}
+    assert "ground_truth" not in reasons["dvl"]
+    (offered,) = re.findall(r"\[dvl\](.*)\[depth\]", summary.toml, re.DOTALL)
+    assert "/ground_truth/odometry" not in offered
     other = inspect_log(foreign.write(imu(), ("/odometry", *odometry[1:])))
-    assert any(
-        "/odometry only if chosen" in role.reason
-        for role in other.roles
-        if role.role == "dvl"
-    )
+    reasons = {role.role: role.reason for role in other.roles}
+    assert "/odometry only if chosen" in reasons["dvl"]
 
 
 def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
@@ -240,7 +236,7 @@ def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
             "pose": {
                 "pose": {
                     "position": vector(step_m * i, 0, 0),
-                    "orientation": {"z": np.sin(y / 2), "w": np.cos(y / 2)},
+                    "orientation": quaternion(Rotation.from_euler("z", y)),
                 }
             }
         }
@@ -283,14 +279,13 @@ def test_a_table_without_a_source_of_its_numbers_is_refused(foreign, toml, said)
 
 def aided(*, wrong: int = -1) -> list[Entry]:
     """Heading of 2 rad and five fixes 3 m east of each other's first, of a vehicle at 1 m/s; one row may be wrong."""
-    turned = {"quaternion": {"z": np.sin(1.0), "w": np.cos(1.0)}}
+    yaws_rad = [2.0] * 5
     places = [(3.0, 4.0, 0.5)] * 5
-    rows = [turned] * 5
     if wrong >= 0:
-        rows[wrong], places[wrong] = (
-            {"quaternion": {"z": 1.0, "w": 0.0}},
-            (900.0, 900.0, 0.0),
-        )
+        yaws_rad[wrong] = np.pi
+        places[wrong] = (900.0, 900.0, 0.0)
+    turns = [quaternion(Rotation.from_euler("z", yaw)) for yaw in yaws_rad]
+    rows = [{"quaternion": turn} for turn in turns]
     headings = rows_of("/gps/heading", TURNED, rows)
     return [headings, points(*places), dvl(velocity=vector(0, 0, 0)), imu()]
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import body_to_ros, range_and_azimuth
+from tests.logs.conftest import quaternion
 
 from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
 
@@ -36,11 +37,7 @@ def poses(
     topic: str = "/ground_truth/pose",
     kind: str = "",
 ) -> Entry:
-    x, y, z, w = rotation.as_quat().tolist()
-    pose = {
-        "position": vector(1, 2, 3),
-        "orientation": {"x": x, "y": y, "z": z, "w": w},
-    }
+    pose = {"position": vector(1, 2, 3), "orientation": quaternion(rotation)}
     if covariance is None:
         return rows_of(topic, POSE, [{"pose": pose}] * 3)
     row = {"pose": {"pose": pose, "covariance": list(covariance)}}
@@ -262,14 +259,11 @@ def test_axes_of_world_and_body_become_ours(
     )
 
 
-def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(n, 6, 6))
-    return root @ root.transpose(0, 2, 1), Rotation.random(n, rng).as_matrix()
-
-
 def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes():
-    covariances, rotations = random_covariances(1, 1)
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(1, 6, 6))
+    covariances = root @ root.transpose(0, 2, 1)
+    rotations = Rotation.random(1, rng).as_matrix()
     pose = gtsam.Pose3(gtsam.Rot3(rotations[0]), np.array([1.0, 2, 3]))
     samples = np.random.default_rng(2).multivariate_normal(
         np.zeros(6), covariances[0] * 1e-8, 20_000
