@@ -178,12 +178,13 @@ class Foreign(Bench):
         toml: str,
         expected: dict[str, Any],
         notes: dict[str, str | None],
+        atol: float = 1e-12,
     ) -> Any:
         """Read entries, and compare values, to single precision, and notes."""
         sequence = self.read(*entries, toml=toml)
         for path, values in expected.items():
             np.testing.assert_allclose(
-                attrgetter(path)(sequence), values, rtol=2e-7, atol=1e-12, err_msg=path
+                attrgetter(path)(sequence), values, rtol=2e-7, atol=atol, err_msg=path
             )
         for name, part in notes.items():
             said = about_values(sequence.notes.get(name, ""))
