@@ -38,7 +38,6 @@ TYPES = {
     "odometry": "nav_msgs/msg/Odometry",
     "detections": "sonar_graph_msgs/msg/LandmarkDetections",
     "map": "sonar_graph_msgs/msg/LandmarkMap",
-    "tf": "tf2_msgs/msg/TFMessage",
 }
 Entry = tuple[Any, ...]
 """Topic, type or a word for it, messages, and the definition where it is not the usual one."""
@@ -56,6 +55,17 @@ def vector(x: float, y: float, z: float) -> dict[str, float]:
 
 def quaternion(rotation: Rotation) -> dict[str, float]:
     return dict(zip("xyzw", rotation.as_quat().tolist(), strict=True))
+
+
+def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> Entry:
+    """One frame below the body; what is not given of its quaternion is zero."""
+    turn = dict.fromkeys("xyzw", 0.0) | rotation
+    transform = {
+        "header": header(0, "base_link"),
+        "child_frame_id": link,
+        "transform": {"translation": vector(*xyz), "rotation": turn},
+    }
+    return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [transform]}]
 
 
 class Bench:
@@ -85,19 +95,12 @@ class Bench:
         }
         return message | {"num_good_beams": 4} | other
 
-    def pressure(
-        self, ns: int, pascals: float, variance: float = 0.0
-    ) -> dict[str, Any]:
-        return {
-            "header": header(ns, "pressure_link"),
-            "fluid_pressure": pascals,
-            "variance": variance,
-        }
+    def pressure(self, ns: int) -> dict[str, Any]:
+        return {"header": header(ns, "pressure_link"), "fluid_pressure": 2e5}
 
-    def odometry(self, ns: int, x: float, **other: Any) -> dict[str, Any]:
-        turn = quaternion(Rotation.identity())
-        pose = {"position": vector(x, 0, 0), "orientation": turn}
-        return {"header": header(ns, "map"), "pose": {"pose": pose}} | other
+    def odometry(self, ns: int) -> dict[str, Any]:
+        pose = {"orientation": quaternion(Rotation.identity())}
+        return {"header": header(ns, "map"), "pose": {"pose": pose}}
 
     def detections(
         self, ns: int, ranges: list[float], ids: list[int], track: tuple[int, ...] = ()
@@ -112,17 +115,6 @@ class Bench:
         return message | {
             "id_probability": [min(0.5, len(ranges) / max(len(ids), 1))] * len(ids),
             "track": list(track),
-        }
-
-    def transform(
-        self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0
-    ) -> dict[str, Any]:
-        turn = quaternion(Rotation.from_euler("z", yaw_rad))
-        moved = {"translation": vector(*xyz), "rotation": turn}
-        return {
-            "header": header(0, parent),
-            "child_frame_id": child,
-            "transform": moved,
         }
 
     def basics(self, samples: int = 5) -> list[Entry]:

@@ -239,8 +239,8 @@ def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck():
     )
 
 
-def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:
-    values = np.random.default_rng(0).standard_normal((rows, 3))
+def moving(*stretches: tuple[slice, Any]) -> Floats:
+    values = np.random.default_rng(0).standard_normal((300, 3))
     for where, value in stretches:
         values[where] = value
     return values

@@ -31,7 +31,7 @@ def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
 
 def test_roles_are_explained_whether_filled_or_not(bench):
     imu, dvl = bench.basics()
-    odometry = ("/odom", "odometry", [bench.odometry(bench.t0_ns, 0.0)])
+    odometry = ("/odom", "odometry", [bench.odometry(bench.t0_ns)])
     path = bench.write(imu, dvl, ("/second", "imu", imu[2]), odometry)
     summary = inspect_log(path)
     assert role(summary, "imu") == (None, "2 topics fit: /imu, /second")
@@ -226,7 +226,7 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
     bench, role, column
 ):
     """A sensor that no estimator needs may have no whole message at all."""
-    pressures = [bench.pressure(bench.t0_ns + i, 2e5) for i in range(9)]
+    pressures = [bench.pressure(bench.t0_ns + i) for i in range(9)]
     path = bench.write(*bench.basics(9), ("/depth", "pressure", pressures))
 
     def without(*broken: int) -> Path:
@@ -271,8 +271,8 @@ def choices(path: Path, config: LogConfig) -> dict[str, object]:
 
 def test_read_back_unchanged_it_makes_the_same_choices(bench, make_sequence, tmp_path):
     imu, dvl = bench.basics()
-    poses = [bench.odometry(bench.t0_ns, 0.0)]
-    pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns, 2e5)])
+    poses = [bench.odometry(bench.t0_ns)]
+    pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns)])
     logs = [
         bench.write(
             imu, dvl, pressure, ("/odom", "odometry", poses), name="plain.mcap"

@@ -21,6 +21,8 @@ from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
 from sonar_graph.logs.writing import imu_messages
 
+from .conftest import tree
+
 LIMIT = 1 << 16
 PACK: dict[str, Callable[[bytes], bytes]] = {
     "zstd": zstandard.compress,
@@ -114,26 +116,19 @@ TRANSLATION = "numbers that are not finite"
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("x_m", "w", "message"),
     [
-        ({"rotation": {"w": np.nan}}, TRANSLATION),
-        ({"rotation": {"w": np.inf}}, TRANSLATION),
-        ({"rotation": {"w": 0.0}}, ROTATION + "0"),
-        ({"translation": {"x": 1e300}}, r"dvl_link: is .* m from base_link"),
-        (
-            {"translation": {"x": 350.0}},
-            r"dvl_link: is .* m from base_link: millimetres",
-        ),
+        (0.0, np.nan, TRANSLATION),
+        (0.0, np.inf, TRANSLATION),
+        (0.0, 0.0, ROTATION + "0"),
+        (1e300, 1.0, r"dvl_link: is .* m from base_link"),
+        (350.0, 1.0, r"dvl_link: is .* m from base_link: millimetres"),
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
-    bench, changed, message
+    bench, x_m, w, message
 ):
-    transform = bench.transform("base_link", "dvl_link", (0, 0, 0))
-    for part, numbers in changed.items():
-        transform["transform"][part] |= numbers
-    tree = ("/tf_static", "tf", [{"transforms": [transform]}])
-    path = bench.write(*bench.basics(), tree)
+    path = bench.write(*bench.basics(), tree("dvl_link", (x_m, 0, 0), w=w))
     pattern = rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"
     with pytest.raises(LogError, match=pattern):
         read_log(path)

@@ -29,6 +29,8 @@ from sonar_graph.logs.vehicle_setup import encode_mountings, gathered, mounting_
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 from sonar_graph.settings import flattened, nested
 
+from .conftest import tree
+
 TREE_M = (1.0, 2.0, 3.0)
 T0_NS = 1_700_000_000_000_000_000
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
@@ -118,7 +120,7 @@ def test_a_frame_is_found_below_the_body_of_any_name(
 
 
 def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench):
-    tree = {"transforms": [bench.transform("base_link", "dvl_link", (1, 2, 3))]}
+    topic, kind, messages = tree("dvl_link", TREE_M, w=1.0)
     mountings = []
     # two seconds after the first file, and an hour later: another recording
     for number, later_s in enumerate((0, 2, 3602)):
@@ -127,7 +129,7 @@ def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench):
         topics = [
             ("/dvl", "dvl", [bench.dvl(ns) for ns in stamps_ns]),
             ("/imu", "imu", [bench.imu(ns) for ns in stamps_ns]),
-            ("/tf_static", "tf", [] if number else [tree]),
+            (topic, kind, [] if number else messages),
         ]
         path = bench.write(*topics, name=f"dive_{number}.mcap")
         mountings.append(read_log(path).calibration.dvl.mounting.translation_m)

@@ -11,7 +11,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs import inspect_log
 from sonar_graph.logs.adapters.aiding_messages import is_unwrapped
 from sonar_graph.measurements import UNMEASURED_M2
-from tests.logs.conftest import quaternion
+from tests.logs.conftest import quaternion, tree
 
 from .conftest import (
     DEFINITIONS,
@@ -22,7 +22,6 @@ from .conftest import (
     imu,
     interface,
     rows_of,
-    tree,
     vector,
 )
 

@@ -9,8 +9,8 @@ import pytest
 from sonar_graph.logs import read_log, write_log
 from sonar_graph.logs.adapters.dvl_messages import repeats
 from sonar_graph.testing import small_world
-from tests.logs.adapters.conftest import imu, rows_of, tree
-from tests.logs.conftest import Entry, vector
+from tests.logs.adapters.conftest import imu, rows_of
+from tests.logs.conftest import Entry, tree, vector
 
 ROWS = 60
 LOST = np.arange(20, 40)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
+from tests.logs.conftest import tree
 
 from .conftest import (
     STEP_NS,
@@ -16,7 +17,6 @@ from .conftest import (
     dvl,
     imu,
     rows_of,
-    tree,
     vector,
     water_linked_text,
 )

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import body_to_ros, range_and_azimuth
-from tests.logs.conftest import quaternion
+from tests.logs.conftest import quaternion, tree
 
-from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
+from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, vector
 
 FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
