@@ -151,12 +151,10 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     yield from _dvl_gap_warnings(imu, dvl, start_ns)
 
 
-BRIDGES = (
-    "too few beams for a whole velocity {}: left out, and bridged as a gap",
-    "no velocity {}: bridged by the IMU, with an error that grows fast",
-    "no velocity {}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)",
-)
-"""Warnings about gaps of the Doppler log with some beams, with and without forces in them."""
+BY_BEAMS = "too few beams for a whole velocity {}: left out, and bridged as a gap"
+BY_FORCE = "no velocity {}: bridged by the IMU, with an error that grows fast"
+BY_WALK = "no velocity {}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)"
+"""Warnings about gaps of the Doppler log, by what bridges them; with the times of the gaps."""
 
 
 def _dvl_gap_warnings(imu: Imu, dvl: Dvl, start_ns: int) -> Iterator[str]:
@@ -166,14 +164,18 @@ def _dvl_gap_warnings(imu: Imu, dvl: Dvl, start_ns: int) -> Iterator[str]:
     partial_ns = dvl.stamps_ns[partial]
     if len(whole_ns) and whole_ns[0] > start_ns:
         yield f"dvl: no whole velocity until {(whole_ns[0] - start_ns) * 1e-9:.3f} s after the start: too few beams"
-    found: dict[str, list[list[int]]] = {bridge: [] for bridge in BRIDGES}
+    found: dict[str, list[list[int]]] = {BY_BEAMS: [], BY_FORCE: [], BY_WALK: []}
     is_long = np.diff(whole_ns) > LONG_GAP_S * 1e9
     for gap in _gaps_where(is_long, whole_ns).tolist():
         # rows of one or two beams inside the gap shorten it
         first, last = np.searchsorted(partial_ns, gap, side="right")
         samples = imu.between(*gap)
-        is_felt = samples and np.isfinite(samples.specific_force).all()
-        found[BRIDGES[0 if last > first else 1 if is_felt else 2]].append(gap)
+        bridge = BY_WALK
+        if last > first:
+            bridge = BY_BEAMS
+        elif samples is not None and np.isfinite(samples.specific_force).all():
+            bridge = BY_FORCE
+        found[bridge].append(gap)
     for bridge, gaps in found.items():
         if gaps:
             yield f"dvl: {bridge.format(_gap_times(gaps, start_ns))}"

@@ -67,26 +67,26 @@ class _Rows(NamedTuple):
 def _joined(table: MessageTable, parts: list[_Rows]) -> _Rows:
     """Rows of all layouts in the order of messages, padded to the most candidates with -1 and probability 0."""
     most = max(1, *(part.ids.shape[1] for part in parts))
-    message = np.concatenate([part.message for part in parts])
-    # rows of one stamp keep the order in which they were sent
-    order = np.argsort(message, kind="stable")
 
     def stacked(columns: Iterable[np.ndarray], filling: int) -> np.ndarray:
         widths = ((0, 0), (0, most))
         padded = (np.pad(c, widths, constant_values=filling)[:, :most] for c in columns)
-        return np.concatenate(list(padded))[order]
+        return np.concatenate(list(padded))
 
     ids = stacked((part.ids for part in parts), -1)
+    message = np.concatenate([part.message for part in parts])
     is_large = (ids >= FIRST_TOO_LARGE_ID).any(axis=1)
     if is_large.any():
-        first = message[order][np.argmax(is_large)]
+        first = message[np.argmax(is_large)]
         raise table.topic.error(
             f"message {first} has an identity of 2^56 or more; {ID_ADVICE}, or do not use them: [detections] use = false"
         )
+    # rows of one stamp keep the order in which they were sent
+    order = np.argsort(message, kind="stable")
     probabilities = stacked((part.probabilities for part in parts), 0)
     columns = zip(*(part.values for part in parts), strict=True)
     values = tuple(np.concatenate(column)[order] for column in columns)
-    return _Rows(message[order], ids, probabilities, values)
+    return _Rows(message[order], ids[order], probabilities[order], values)
 
 
 _LISTS = ("range_m", "azimuth_rad", "covariance", "candidate_ids", "id_probability")

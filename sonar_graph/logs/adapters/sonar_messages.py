@@ -138,8 +138,11 @@ class SonarAdapter(Adapter):
         """Images of messages of one layout, apart where beams, bins or samples differ."""
         count = len(group)
         paths = [getattr(self, name) for name in KINDS]
-        flags = [group[path] if path else np.full(count, -1) for path in paths]
-        kinds = np.column_stack(flags).astype(np.int64)
+        flags = [
+            group[path].astype(np.int64) if path else np.full(count, -1)
+            for path in paths
+        ]
+        kinds = np.column_stack(flags)
         bins = group[str(self.ranges or self.range_resolution)]
         bins_m = np.asarray(bins, float).reshape(count, -1)
         if self.directions is not None:
