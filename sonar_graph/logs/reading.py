@@ -437,9 +437,9 @@ class Assembly:
         if role == "dvl" and imu is not None and self._may_lack_lock:
             advice = "; `are_zeros_measured = true` under [dvl] in a log configuration uses them"
             return unfelt_zeros(imu, rows, self.calibration), UNFELT, advice
-        may_be_stuck = role in LEAST_MOVED and imu is not None and len(rows) > 1
+        may_be_stuck = role in LEAST_MOVED and len(rows) > 1
         dvl = self.block("dvl") if may_be_stuck else None
-        if dvl is None:
+        if imu is None or dvl is None:
             return none, "", ""
         # a sensor is stuck where it repeats its value while the vehicle moves
         moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)

@@ -326,7 +326,9 @@ def recorded_calibration(calibration: Calibration) -> str:
 def recorded_fields(path: Path) -> dict[str, Any] | None:
     """Fields of a calibration that a log's record states, as JSON has them; None without one."""
     recorded = read_calibration(scan(path))
-    return recorded and recorded.model_dump(mode="json", exclude_unset=True)
+    if recorded is None:
+        return None
+    return recorded.model_dump(mode="json", exclude_unset=True)
 
 
 def static_mounting(path: Path, frame: str) -> Mounting | None:
