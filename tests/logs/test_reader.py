@@ -96,7 +96,7 @@ def test_every_message_is_found_whatever_the_container(path, options):
     assert len(recording.topics["/bytes"]) == len(written)
     # only the stamps were wanted
     assert list(recording.topics["/bytes"].stacks) == [12]
-    assert calls == sorted(calls)
+    assert calls == sorted(calls) != []
     assert {total for _, total in calls} <= {path.stat().st_size}
     pieces: dict[str, list[Stored]] = {}
     for piece in stream(path, lambda _: Keep.ALL):

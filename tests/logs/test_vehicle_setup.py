@@ -132,7 +132,11 @@ def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench):
             (topic, kind, [] if number else messages),
         ]
         path = bench.write(*topics, name=f"dive_{number}.mcap")
-        mountings.append(read_log(path).calibration.dvl.mounting.translation_m)
+        found = read_log(path)
+        mountings.append(found.calibration.dvl.mounting.translation_m)
+        placed = "none; not" if later_s == 3602 else "dvl (dvl_link); not"
+        said = f"defaults; mountings from /tf_static: {placed} in the tree, taken as"
+        assert found.notes["log.calibration"].startswith(said)
     assert mountings == [TREE_M, TREE_M, (0, 0, 0)]
 
 

@@ -156,8 +156,8 @@ CASES: dict[str, Case] = {
         [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
         chosen, {"truth.positions": [(1, 2, 3)] * 3}, {"log.truth": None})
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
-    "odometry of another name": (
-        [poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry")], "", {}, {"log.truth": "/odom only if chosen"}),
+    **{f"a pose at {entry[0]}": ([entry], "", {}, {"log.truth": f"{entry[0]} only if chosen"})
+       for entry in (poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose"))},
     # landmarks
     "positions as range and azimuth, results as the posterior": (
         [arrays(*FRAMES)], "",
