@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,8 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, DataEnd, Header
 
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
@@ -33,19 +34,11 @@ PACK: dict[str, Callable[[bytes], bytes]] = {
 
 def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> Path:
     packed = PACK[compression](content)
-    letters = compression.encode()
-    head = (
-        struct.pack("<QQQII", 1, 2, size, 0, len(letters))
-        + letters
-        + struct.pack("<Q", len(packed))
-    )
-    chunk = struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed
-    path.write_bytes(
-        MCAP_MAGIC
-        + struct.pack("<BQII", 1, 8, 0, 0)
-        + chunk
-        + struct.pack("<BQI", 15, 4, 0)
-    )
+    builder = RecordBuilder()
+    Header(profile="", library="").write(builder)
+    Chunk(compression, packed, 1, 1, 0, size).write(builder)
+    DataEnd(0).write(builder)
+    path.write_bytes(MCAP_MAGIC + builder.end())
     return path
 
 
