@@ -30,6 +30,7 @@ from sonar_graph.logs.roles import (
     Window,
     as_window,
     choose_each,
+    choose_topic,
     choose_topics,
 )
 from sonar_graph.logs.vehicle_setup import (
@@ -145,9 +146,7 @@ def sonar_frame(
     topic, config
         As for `read_sonar_frames`.
     """
-    choice = choose_each(
-        recording, {SONAR: topic} if topic else {}, config or LogConfig(), (SONAR,)
-    )[SONAR]
+    choice = choose_topic(SONAR, recording, config or LogConfig(), topic)
     if choice.topic is None or choice.adapter is None:
         return None
     images = recording.topics[choice.topic]

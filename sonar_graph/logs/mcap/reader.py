@@ -6,6 +6,7 @@ unchecked, only when a summary under a CRC states that it holds no wanted topic,
 """
 
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -117,10 +118,9 @@ class Passage:
         summary = self._file.summary
         if summary is None or summary.statistics is None:
             return None
-        found: dict[str, int] = {}
+        found = Counter[str]()
         for channel, count in summary.statistics.channel_message_counts.items():
-            name = self._name(channel)
-            found[name] = found.get(name, 0) + count
+            found[self._name(channel)] += count
         return found or None
 
     def __iter__(self) -> Iterator[ChunkPart]:

@@ -12,7 +12,7 @@ from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.measurements import Floats
 from tests.logs.conftest import copy, recorded, writing
 
-from .conftest import Entry, dvl, imu, rows_of, vector
+from .conftest import Entry, at, dvl, imu, rows_of, vector
 
 AZIMUTHS = np.radians([30.0, 0.0, -30.0])
 """Left, middle, right."""
@@ -169,3 +169,9 @@ def test_messages_that_are_no_image_are_refused_by_their_time(foreign, tmp_path,
     blocks = read_sonar_frames(path, refused=lambda at_ns, _: refused.append(at_ns))
     assert sum(map(len, blocks)) == 6 - len(bad)
     assert refused == [times_ns[row] for row in bad]
+
+
+def test_a_block_of_frames_ends_before_an_earlier_stamp(foreign):
+    earlier = image(ROWS) | {"header": at(-1)}
+    blocks = frames_in(foreign, images(image(ROWS), image(ROWS), earlier))
+    assert [len(block) for block in blocks] == [2, 1]
