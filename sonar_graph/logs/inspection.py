@@ -105,6 +105,18 @@ class TopicSummary:
 
 
 @dataclass(frozen=True)
+class RoleSummary:
+    """The topic that plays a role."""
+
+    role: str
+    topic: str | None
+    """None: no topic plays it, or several could."""
+    reason: str
+    candidates: tuple[str, ...] = ()
+    """The topics that fit, where they are several."""
+
+
+@dataclass(frozen=True)
 class LogSummary:
     """Content of a log, and its faults.
 
@@ -122,7 +134,7 @@ class LogSummary:
     name: str | None
     """Name in the log's record."""
     topics: tuple[TopicSummary, ...]
-    roles: tuple[Choice, ...]
+    roles: tuple[RoleSummary, ...]
     calibration: str
     """Source of the calibration, or the reason why the one in the log cannot be used; empty where `unusable` names it."""
     notes: dict[str, str]
@@ -278,7 +290,10 @@ def inspect_log(
         path=recording.path,
         name=recorded_name(recording),
         topics=summaries,
-        roles=tuple(choices.values()),
+        roles=tuple(
+            RoleSummary(c.role, c.topic, c.reason, c.candidates)
+            for c in choices.values()
+        ),
         calibration=calibrated,
         notes=notes,
         damage=tuple(damage),
