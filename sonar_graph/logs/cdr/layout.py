@@ -104,8 +104,8 @@ class Counted(DecodingStep):
     def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the place of the first value and their count; the NUL that closes a string is one."""
         at, count = layout.counted(self, at, length_of)
-        # numbers are aligned where there is one
-        if count:
+        # numbers are aligned where there is one, and texts need no step for it
+        if count and self._size > 1:
             at += padding(at, self._size)
         layout.found[self] += (at, count)
         return at + count * self._size
