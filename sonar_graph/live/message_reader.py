@@ -84,4 +84,4 @@ class MessageReader:
 
 def _sizes(adapter: Adapter, group: Messages) -> list[tuple[int, ...]]:
     """Number of elements of each field that an adapter reads."""
-    return [group[field_of(path)[0]].shape[1:] for path in adapter.fields()]
+    return [group[field_of(path)[0]].shape[1:] for path in adapter.fields_used()]

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from sonar_graph import at_first_use
 
 if TYPE_CHECKING:
-    from sonar_graph.logs.amending import Amended, write_amended
-    from sonar_graph.logs.checks import DRIFTING, FELT_ALONG, OTHER_WAYS, STEPPED_BACK, axis_doubts, gravity_warning, is_without_gravity, stuck_quantities, unfelt_zeros  # noqa: E501
-    from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
+    from sonar_graph.logs.amending import write_amended
+    from sonar_graph.logs.checks import DRIFTING, FELT_ALONG, OTHER_WAYS, STEPPED_BACK, axis_doubts, gravity_warning, is_without_gravity, stuck_quantities  # noqa: E501
+    from sonar_graph.logs.inspection import LogSummary, inspect_log
     from sonar_graph.logs.live_record import DROPPED_TOPIC, LATENESS, LIVE_RATE, LiveRecord, dropped_in, pinned
     from sonar_graph.logs.reading import Assembly, read_log, row_notes, rows_of
     from sonar_graph.logs.result_log import write_result
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = at_first_use(__name__)
 __all__ = [
-    "Amended", "Assembly", "Choice", "DETECTIONS", "DRIFTING", "DROPPED_TOPIC", "FELT_ALONG", "ImagesAlone",
+    "Assembly", "Choice", "DETECTIONS", "DRIFTING", "DROPPED_TOPIC", "FELT_ALONG", "ImagesAlone",
     "LATENESS", "LIVE_RATE", "LiveRecord", "LogSummary", "METADATA", "OTHER_WAYS", "PICTURES", "PartialCalibration",
-    "Picture", "ROLES", "STEPPED_BACK", "TAKEN_AS_ZERO", "TopicSummary", "Window", "axis_doubts", "choose_each",
+    "Picture", "ROLES", "STEPPED_BACK", "TAKEN_AS_ZERO", "Window", "axis_doubts", "choose_each",
     "choose_topics", "detection_messages", "dropped_in", "gravity_warning", "inspect_log", "is_without_gravity",
     "joined_calibration", "lacking_navigation", "landmark_map_message", "landmark_markers", "no_images", "pinned",
     "read_images_alone", "read_log", "read_sonar_frames", "row_notes", "rows_of", "sonar_frame",
-    "sonar_image_messages", "stuck_quantities", "unfelt_zeros", "wanted_types", "with_notes", "write_amended",
+    "sonar_image_messages", "stuck_quantities", "wanted_types", "with_notes", "write_amended",
     "write_landmarks_csv", "write_log", "write_result", "write_tum"]

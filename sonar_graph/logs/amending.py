@@ -4,32 +4,33 @@ The log is read as every log is (`sonar_graph.logs.mcap.reader`): of one that is
 """
 
 import heapq
+import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, groupby, repeat
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
-from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.mcap import (
-    ChunkPart,
     Damage,
+    Found,
     Keep,
     LogFile,
     LogWriter,
     Outgoing,
     Passage,
+    Record,
     Recording,
     SchemaText,
+    Topic,
     by_time,
     content_of,
     header_of,
@@ -40,6 +41,8 @@ from sonar_graph.logs.mcap import (
 
 _Message = tuple[int, int, int, bytes, int]
 """Log time, channel, publish time, payload, sequence number."""
+_HEAD = struct.Struct("<IQQ")
+"""Sequence number, log time and publish time before a payload."""
 
 
 @dataclass
@@ -93,170 +96,126 @@ def write_amended(
     with ExitStack() as opened:
         logs = [opened.enter_context(LogFile(part)) for part in log_parts(source)]
         out = opened.enter_context(written_whole(target))
-        copy = _AmendedCopy(
-            source, logs, out, anew or {}, {entry.topic for entry in added}
-        )
-        return copy.run(added, more, metadata or {}, salvage)
+        header = header_of(logs[0].path)
+        # the profile states to viewers of ROS what they read
+        writer = LogWriter(out, header.profile if header else "", is_copy=True)
+        topics = {entry.topic for entry in added}
+        copy = _AmendedCopy(source, writer, anew or {}, topics - (anew or {}).keys())
+        copy.write(logs, added, more, salvage=salvage)
+        for name, values in (metadata or {}).items():
+            writer.add_metadata(name, values)
+        writer.finish()
+    return copy.amended
 
 
+@dataclass
 class _AmendedCopy:
     """A log on its way into another file."""
 
-    def __init__(
-        self,
-        source: Path,
-        logs: list[LogFile],
-        out: BinaryIO,
-        anew: Mapping[str, str],
-        added: Set[str],
-    ) -> None:
-        self._source = source
-        self._anew = anew
-        self._taken = set(added - anew.keys())
-        self._passages = [
-            (log, Passage(log, lambda _: Keep.ALL, may_skip=False)) for log in logs
-        ]
-        header = header_of(logs[0].path)
-        # the profile states to viewers of ROS what they read
-        profile = header.profile if header else ""
-        self._writer = LogWriter(out, profile, is_copy=True)
-        self._amended = Amended()
-        self._beginning_ns: int | None = None
+    source: Path
+    writer: LogWriter
+    anew: Mapping[str, str]
+    taken: set[str]
+    """Topics that the log must not have."""
+    amended: Amended = field(default_factory=Amended)
+    beginning_ns: int | None = None
 
-    def run(
+    def write(
         self,
+        logs: list[LogFile],
         added: Sequence[Outgoing],
         more: Iterable[Outgoing],
-        metadata: Mapping[str, Mapping[str, str]],
+        *,
         salvage: bool,
-    ) -> Amended:
-        writer = self._writer.mcap
-        amended = self._amended
-        damage = Damage()
+    ) -> None:
+        """Write messages, metadata and attachments of the files of a log, and the added messages."""
+        passages = [Passage(log, lambda _: Keep.ALL, may_skip=False) for log in logs]
         # those of ``more`` go first: their topic is taken before the log's are copied
-        merged = heapq.merge(
+        for log_time_ns, channel, sent_ns, payload, number in heapq.merge(
             self._streamed(more),
-            self._recorded(),
+            chain.from_iterable(map(self._recorded, passages)),
             self._added(added),
             key=lambda message: message[0],
-        )
-        for log_time_ns, channel, sent_ns, payload, number in merged:
-            writer.add_message(channel, log_time_ns, payload, sent_ns, number)
-        for log, passage in self._passages:
+        ):
+            self.writer.mcap.add_message(channel, log_time_ns, payload, sent_ns, number)
+        damage = Damage()
+        for log, passage in zip(logs, passages, strict=True):
             # known only when all messages have been read
-            damage.extend(
-                passage.damage, log.path.name if len(self._passages) > 1 else ""
-            )
+            damage.extend(passage.damage, log.path.name if len(logs) > 1 else "")
         recording = Recording(
-            self._source, damage=damage, beginning_ns=self._beginning_ns
+            self.source, damage=damage, beginning_ns=self.beginning_ns
         )
         if not salvage:
             recording.require_sound()
-        for log, record in (
-            (log, record)
-            for log, passage in self._passages
-            for record in passage.others
-        ):
-            content = content_of(log, record)
-            if record.opcode == Opcode.METADATA:
-                found = parse(Metadata.read, content)
-                writer.add_metadata(found.name, found.metadata)
-            # a CRC of zero means none
-            elif content[-4:] in (
-                bytes(4),
-                zlib.crc32(content[:-4]).to_bytes(4, "little"),
-            ):
-                file = parse(Attachment.read, content)
-                writer.add_attachment(
-                    file.create_time,
-                    file.log_time,
-                    file.name,
-                    file.media_type,
-                    file.data,
-                )
-            else:
-                amended.notes["log.attachments"] = (
-                    f"one at byte {record.at} is damaged and left out"
-                )
-        for name, values in metadata.items():
-            self._writer.add_metadata(name, values)
-        self._writer.finish()
+        for log, passage in zip(logs, passages, strict=True):
+            for record in passage.others:
+                self._copy_other(record, content_of(log, record))
         notes = recording.notes()
-        amended.notes |= {
+        self.amended.notes |= {
             name: notes[name] for name in ("log.ending", "log.damage") if name in notes
         }
-        return amended
 
-    def _recorded(self) -> Iterator[_Message]:
+    def _copy_other(self, record: Record, content: bytes) -> None:
+        """Copy metadata, or an attachment whose CRC fits."""
+        writer = self.writer.mcap
+        if record.opcode == Opcode.METADATA:
+            found = parse(Metadata.read, content)
+            writer.add_metadata(found.name, found.metadata)
+        # a CRC of zero means none
+        elif int.from_bytes(content[-4:], "little") in (0, zlib.crc32(content[:-4])):
+            file = parse(Attachment.read, content)
+            writer.add_attachment(
+                file.create_time, file.log_time, file.name, file.media_type, file.data
+            )
+        else:
+            self.amended.notes["log.attachments"] = (
+                f"one at byte {record.at} is damaged and left out"
+            )
+
+    def _recorded(self, passage: Passage) -> Iterator[_Message]:
         """Messages of the log that are copied; those of one chunk in the order of their times."""
-        for _, passage in self._passages:
-            yield from self._recorded_in(passage)
-
-    def _recorded_in(self, passage: Passage) -> Iterator[_Message]:
         # a chunk comes topic by topic, and its messages have to be merged by time
         for _, chunk in groupby(passage, key=lambda piece: id(piece.data)):
-            copied = [
-                (piece, channel)
-                for piece in chunk
-                if (channel := self._channel(piece, passage)) is not None
-            ]
-            if not copied:
-                continue
-            pieces = [piece for piece, _ in copied]
-            data = pieces[0].data
-            columns = zip(*(piece.found for piece in pieces), strict=True)
-            at, size, time_ns = (np.concatenate(column) for column in columns)
-            # messages of all topics of a chunk, to be sorted by time
-            of = np.repeat(
-                np.arange(len(pieces)), [len(piece.found.sizes) for piece in pieces]
-            )
-            for row in np.lexsort((at, time_ns)).tolist():
-                begin = int(at[row])
-                channel = copied[of[row]][1]
-                payload = bytes(data[begin : begin + int(size[row])])
+            rows: list[Any] = []
+            for topic, data, found in chunk:
+                channel = self._channel(topic, found, passage)
+                if channel is not None:
+                    columns = (found.log_times_ns, found.offsets, found.sizes)
+                    times = (column.tolist() for column in columns)
+                    rows += zip(*times, repeat(channel), repeat(data))
+            for time_ns, at, size, channel, data in sorted(
+                rows, key=lambda row: row[:2]
+            ):
                 # before each payload is the head of its record
-                number, published_ns = (
-                    int.from_bytes(data[begin - first : begin - end], "little")
-                    for first, end in ((20, 16), (8, 0))
-                )
-                yield int(time_ns[row]), channel, published_ns, payload, number
+                number, _, published_ns = _HEAD.unpack_from(data, at - _HEAD.size)
+                payload = bytes(data[at : at + size])
+                yield time_ns, channel, published_ns, payload, number
 
-    def _channel(self, piece: ChunkPart, passage: Passage) -> int | None:
+    def _channel(self, topic: Topic, found: Found, passage: Passage) -> int | None:
         """Channel of messages in the copy; None where their topic is rewritten."""
-        first_ns = int(piece.found.log_times_ns.min())
-        self._beginning_ns = (
-            first_ns
-            if self._beginning_ns is None
-            else min(first_ns, self._beginning_ns)
-        )
-        topic = piece.topic
-        wanted = self._anew.get(topic.name)
+        first_ns = int(found.log_times_ns.min())
+        if self.beginning_ns is None or first_ns < self.beginning_ns:
+            self.beginning_ns = first_ns
+        wanted = self.anew.get(topic.name)
         # two types on one topic confuse every reader
-        if topic.name in self._taken or (
-            wanted is not None and short_name(topic.type_name) != short_name(wanted)
-        ):
+        if topic.name in self.taken or (wanted is not None and not topic.is_a(wanted)):
             raise LogError(
-                f"{self._source}: {topic.name} ({topic.type_name}) is in the log already; "
+                f"{self.source}: {topic.name} ({topic.type_name}) is in the log already; "
                 "leave it out where the log is made"
             )
         if wanted is not None:
-            self._amended.replaced[topic.name] += len(piece.found.sizes)
+            self.amended.replaced[topic.name] += len(found.sizes)
             return None
-        channel, schema = passage.as_written[topic.name]
-        return self._writer.channel(
-            topic.name,
-            SchemaText(schema.name, schema.encoding, schema.data),
-            topic.encoding,
-            channel.metadata,
-        )
+        channel, schema = passage.described.as_written[topic.name]
+        text = SchemaText(schema.name, schema.encoding, schema.data)
+        return self.writer.channel(topic.name, text, topic.encoding, channel.metadata)
 
     def _added(self, added: Sequence[Outgoing]) -> Iterator[_Message]:
         for time_ns, entry, payload in by_time(added):
-            schema = own_schema(entry.type_name)
-            channel = self._writer.channel(entry.topic, schema)
+            channel = self.writer.channel(entry.topic, own_schema(entry.type_name))
             yield time_ns, channel, time_ns, payload, 0
 
     def _streamed(self, more: Iterable[Outgoing]) -> Iterator[_Message]:
         for entry in more:
-            self._taken.add(entry.topic)
+            self.taken.add(entry.topic)
             yield from self._added([entry])

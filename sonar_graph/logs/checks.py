@@ -22,6 +22,7 @@ from sonar_graph.calibration import (
 from sonar_graph.devices import is_partial
 from sonar_graph.logs.adapters import Z_DOWN_TYPES, Adapter
 from sonar_graph.measurements import NS_PER_S, Depth, Dvl, Floats, Imu, Ints
+from sonar_graph.states import counted
 
 Mask = NDArray[np.bool_]
 MOST_NAMED = 3
@@ -82,7 +83,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     # data sets begin at 0: recorded at 0, a stamp of 0 is right
     unset = (stamps_ns == 0) & (log_times_ns != 0)
     if unset.any():
-        yield f"{_count(int(unset.sum()), 'message')} without a stamp: the time of recording is used"
+        yield f"{counted(int(unset.sum()), 'message')} without a stamp: the time of recording is used"
     stamps_ns = stamps_ns[~unset]
     log_times_ns = log_times_ns[~unset]
     if len(stamps_ns) < 2:
@@ -94,7 +95,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
         yield f"{often} backwards, by {-steps_ns.min() / 1e9:.3g} s at most: rows are sorted"
     repeated = len(stamps_ns) - len(np.unique(stamps_ns))
     if repeated:
-        yield f"{_count(repeated, 'message')} with the stamp of another"
+        yield f"{counted(repeated, 'message')} with the stamp of another"
     # the recorder's clock is the only other one that a log has
     lag_ns = log_times_ns - stamps_ns
     typical_s = float(np.median(lag_ns)) / 1e9
@@ -147,40 +148,37 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
         )
         guess = "the turn in between is guessed from the rates before and after"
         yield f"imu: no sample {_gap_times(holes, start_ns)}: {guess}, {turns}"
-    yield from _dvl_gap_warnings(imu, dvl, round(LONG_GAP_S * 1e9), start_ns)
+    yield from _dvl_gap_warnings(imu, dvl, start_ns)
 
 
-def _dvl_gap_warnings(
-    imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int
-) -> Iterator[str]:
+BY_BEAMS = "too few beams for a whole velocity {}: left out, and bridged as a gap"
+BY_FORCE = "no velocity {}: bridged by the IMU, with an error that grows fast"
+BY_WALK = "no velocity {}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)"
+"""Warnings about gaps of the Doppler log, by what bridges them; with the times of the gaps."""
+
+
+def _dvl_gap_warnings(imu: Imu, dvl: Dvl, start_ns: int) -> Iterator[str]:
     """Gaps of the Doppler log, grouped by how estimators bridge them."""
     partial = is_partial(dvl.velocity_cov)
     whole_ns = dvl.stamps_ns[~partial]
     partial_ns = dvl.stamps_ns[partial]
     if len(whole_ns) and whole_ns[0] > start_ns:
         yield f"dvl: no whole velocity until {(whole_ns[0] - start_ns) * 1e-9:.3f} s after the start: too few beams"
-    by_beams = []
-    by_force = []
-    by_walk = []
-    for gap in _gaps_where(np.diff(whole_ns) > longest_ns, whole_ns).tolist():
+    found: dict[str, list[list[int]]] = {BY_BEAMS: [], BY_FORCE: [], BY_WALK: []}
+    is_long = np.diff(whole_ns) > LONG_GAP_S * 1e9
+    for gap in _gaps_where(is_long, whole_ns).tolist():
         # rows of one or two beams inside the gap shorten it
         first, last = np.searchsorted(partial_ns, gap, side="right")
         samples = imu.between(*gap)
+        bridge = BY_WALK
         if last > first:
-            by_beams.append(gap)
+            bridge = BY_BEAMS
         elif samples is not None and np.isfinite(samples.specific_force).all():
-            by_force.append(gap)
-        else:
-            by_walk.append(gap)
-    if by_beams:
-        yield f"dvl: too few beams for a whole velocity {_gap_times(by_beams, start_ns)}: left out, and bridged as a gap"
-    if by_force:
-        yield f"dvl: no velocity {_gap_times(by_force, start_ns)}: bridged by the IMU, with an error that grows fast"
-    if by_walk:
-        times = _gap_times(by_walk, start_ns)
-        yield (
-            f"dvl: no velocity {times}, and no accelerometer: bridged by a random walk (dvl.velocity_walk_density)"
-        )
+            bridge = BY_FORCE
+        found[bridge].append(gap)
+    for bridge, gaps in found.items():
+        if gaps:
+            yield f"dvl: {bridge.format(_gap_times(gaps, start_ns))}"
 
 
 def imu_holes(stamps_ns: Ints) -> Ints:
@@ -221,10 +219,6 @@ def _longest(first_ns: Ints, last_ns: Ints, size: Ints, origin_ns: int) -> str:
         f"{(first_ns[k] - origin_ns) * 1e-9:.3f} to {(last_ns[k] - origin_ns) * 1e-9:.3f}"
         for k in named
     )
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def is_without_gravity(specific_force: Floats, gravity_m_s2: float) -> bool:
@@ -305,20 +299,18 @@ def axis_doubts(
     """Sentences about dead and clipped axes of gyros and Doppler log, each after its role."""
     if calibration.odometry_interpolation != "linear":
         return
-    rate = imu.angular_velocity
-    for fault in (
-        *two_sensors(rate, "angular rate", "imu"),
-        *dead_axes(rate, "angular rate"),
-        *clipped_axes(rate, "angular rate"),
-    ):
-        yield f"imu: {fault}: headings and positions are wrong from the first turn on"
+    rate = fresh_rows(imu.angular_velocity)
+    for check in (two_sensors, dead_axes, clipped_axes):
+        for fault in check(rate, "angular rate"):
+            yield f"imu: {fault}: headings and positions are wrong from the first turn on"
+    velocity = fresh_rows(dvl.velocity)
     faults = [
-        *two_sensors(dvl.velocity, "velocity", "dvl"),
-        *clipped_axes(dvl.velocity, "velocity"),
-        *magnitudes(dvl.velocity),
+        *two_sensors(velocity, "velocity"),
+        *clipped_axes(velocity, "velocity"),
+        *magnitudes(velocity, "velocity"),
     ]
     if is_measured_in_full(depth, calibration):
-        faults += dead_axes(dvl.velocity, "velocity", most=2)
+        faults += dead_axes(velocity, "velocity", most=2)
     yield from (f"dvl: {fault}: positions are wrong" for fault in faults)
 
 
@@ -350,7 +342,7 @@ def row_oddities(
         if "velocity" not in named:
             yield "dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
         if not is_measured_in_full(depth, calibration):
-            for fault in dead_axes(dvl.velocity, "velocity"):
+            for fault in dead_axes(fresh_rows(dvl.velocity), "velocity"):
                 yield "dvl", fault
     if imu is not None and dvl is not None and depth is not None:
         way_m = way_by("positions", imu, dvl, calibration, depth.stamps_ns)
@@ -386,17 +378,17 @@ def fresh_rows(values: Floats) -> Floats:
     return fresh if len(fresh) >= FEWEST_FRESH else fresh[:0]
 
 
-def two_sensors(values: Floats, quantity: str, role: str) -> Iterator[str]:
+def two_sensors(fresh: Floats, quantity: str) -> Iterator[str]:
     """A quantity, shape (n, 3), whose rows are of two sensors that take turns.
 
     Differences over one row are as large as those over two where all is noise, and smaller where the signal is smooth.
     """
-    fresh = fresh_rows(values)
     if not len(fresh):
         return
     over_one = np.abs(fresh[1:] - fresh[:-1]).mean(axis=0)
     over_two = np.abs(fresh[2:] - fresh[:-2]).mean(axis=0)
     axis = int(np.argmax(over_one - ALTERNATING * over_two))
+    role = "dvl" if quantity == "velocity" else "imu"
     if over_one[axis] > ALTERNATING * over_two[axis]:
         yield (
             f"{quantity} along {'xyz'[axis]} changes by {over_one[axis]:.2g} from row to row, and by {over_two[axis]:.2g} "
@@ -404,12 +396,11 @@ def two_sensors(values: Floats, quantity: str, role: str) -> Iterator[str]:
         )
 
 
-def dead_axes(values: Floats, quantity: str, most: int = 1) -> Iterator[str]:
+def dead_axes(fresh: Floats, quantity: str, most: int = 1) -> Iterator[str]:
     """Axes of a quantity, shape (n, 3), that never change; nothing where they are more than ``most``.
 
     A robot on wheels has two axes that never change.
     """
-    fresh = fresh_rows(values)
     if not len(fresh):
         return
     dead = np.flatnonzero(np.ptp(fresh, axis=0) == 0)
@@ -424,15 +415,14 @@ def dead_axes(values: Floats, quantity: str, most: int = 1) -> Iterator[str]:
         yield text
 
 
-def clipped_axes(values: Floats, quantity: str) -> Iterator[str]:
+def clipped_axes(fresh: Floats, quantity: str) -> Iterator[str]:
     """Axes of a quantity, shape (n, 3), that are clipped.
 
     Noise makes every value its own, so that the largest one comes once. Where it comes `FEWEST_CLIPPED` times, in
     `CLIPPED_SHARE` of the rows, and `CLIPPED_RATIO` times as often as the next, the sensor or its driver cuts there.
     """
-    fresh = fresh_rows(values)
-    for axis in range(fresh.shape[1] if len(fresh) else 0):
-        found, counts = np.unique(fresh[:, axis], return_counts=True)
+    for axis, values in enumerate(fresh.T):
+        found, counts = np.unique(values, return_counts=True)
         if len(found) < FEWEST_VALUES:
             continue
         for limit, often, beside in (
@@ -447,15 +437,14 @@ def clipped_axes(values: Floats, quantity: str) -> Iterator[str]:
                 )
 
 
-def magnitudes(velocity: Floats) -> Iterator[str]:
-    """Velocities, shape (n, 3), without a sign: no axis is ever negative, and those that come near 0 turn there."""
-    fresh = fresh_rows(velocity)
+def magnitudes(fresh: Floats, quantity: str) -> Iterator[str]:
+    """A quantity, shape (n, 3), without a sign: no axis is ever negative, and those that come near 0 turn there."""
     if not len(fresh) or (fresh < 0).any():
         return
     # a vehicle that only goes ahead has one such axis; to the side and up it goes both ways
     is_near = fresh.min(axis=0) < NEAR_ZERO * fresh.std(axis=0)
     if np.count_nonzero(is_near) >= 2:
-        yield "velocity is never negative along any axis: magnitudes without a sign"
+        yield f"{quantity} is never negative along any axis: magnitudes without a sign"
 
 
 def stamp_doubts(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
@@ -511,19 +500,16 @@ def spike_warning(stamps_ns: Ints, values: Floats, quantity: str) -> str | None:
     # a row without accelerometers is no spike
     off[np.isnan(off)] = 0.0
     agree = np.linalg.norm(values[2:] - values[:-2], axis=1) < off / 2
-    spikes = (
-        np.flatnonzero(
-            agree & (off > max(least, SPIKE_RATIO * float(np.quantile(off, 0.99))))
-        )
-        + 1
-    )
-    if not spikes.size:
+    # the first row has no neighbour before it
+    off[~agree | (off <= max(least, SPIKE_RATIO * float(np.quantile(off, 0.99))))] = 0.0
+    count = int(np.count_nonzero(off))
+    if not count:
         return None
-    largest = int(spikes[np.argmax(off[spikes - 1])])
-    at_s = (stamps_ns[largest] - stamps_ns[0]) * 1e-9
+    largest = int(np.argmax(off))
+    at_s = (stamps_ns[largest + 1] - stamps_ns[0]) * 1e-9
     return (
-        f"{_count(len(spikes), quantity)} {'stands' if len(spikes) == 1 else 'stand'} out from both neighbours, "
-        f"by {off[largest - 1]:.3g} {unit} at most, {at_s:.3f} s after the first: {effect}, leave such messages out"
+        f"{counted(count, quantity)} {'stands' if count == 1 else 'stand'} out from both neighbours, by "
+        f"{off[largest]:.3g} {unit} at most, {at_s:.3f} s after the first: {effect}, leave such messages out"
     )
 
 
@@ -545,16 +531,14 @@ def stuck_warning(
         is_long &= runs.span(way_m) / duration_s > FASTEST_RESTING_M_S
     is_zero = ~np.any(values[runs.first], axis=1)
     texts = []
-    for chosen, what in (
-        (is_long & is_zero, "exactly zero"),
-        (is_long & ~is_zero, "the same to the last bit"),
-    ):
-        if not chosen.any():
-            continue
-        rows, times = runs.text(chosen, stamps_ns)
-        count = np.count_nonzero(chosen)
-        more = f" of {count} stretches, the longest" if count > MOST_NAMED else ","
-        texts.append(f"{what} in {rows} rows{more} {times} s after the first")
+    for what, chosen in {
+        "exactly zero": is_long & is_zero,
+        "the same to the last bit": is_long & ~is_zero,
+    }.items():
+        if count := np.count_nonzero(chosen):
+            rows, times = runs.text(chosen, stamps_ns)
+            more = f" of {count} stretches, the longest" if count > MOST_NAMED else ","
+            texts.append(f"{what} in {rows} rows{more} {times} s after the first")
     if not texts:
         return None
     why = "sending without lock" if quantity == "velocity" else "repeating old values"
@@ -621,30 +605,26 @@ class Runs(NamedTuple):
         return int(rows.sum()), _longest(begin_ns, end_ns, rows, int(stamps_ns[0]))
 
 
-def stuck_rows(
-    stamps_ns: Ints,
-    values: Floats,
-    others: Mapping[str, tuple[Ints, Floats]],
-    *,
-    may_rest: bool = False,
-) -> Mask:
-    """Mask of rows, shape (n,), of values, shape (n, k), that repeat to the bit while all others change.
+def stuck_rows(quantity: str, rows: Mapping[str, tuple[Ints, Floats]]) -> Mask:
+    """Mask of rows of a quantity, shape (n,), that repeat to the bit while all others change.
 
     A vehicle at rest in a simulator repeats all sensors. Noise never repeats, so that one sensor that repeats alone is
-    stuck.
+    stuck; a velocity of zeros is a value at rest.
 
-    ``others``: stamps and values of the other sensors, by name. ``may_rest``: zeros are a value at rest.
+    ``rows``: stamps and values, shape (n, k), of all quantities, by name.
     """
+    stamps_ns, values = rows[quantity]
     runs = Runs.of(differing(values))
     chosen = runs.are_long(stamps_ns, SURELY_STUCK_S, SURELY_STUCK_ROWS)
     chosen &= ~runs.may_be_chance()
-    if may_rest:
+    if quantity == "velocity":
         chosen &= values[runs.first].any(axis=1)
     for run in np.flatnonzero(chosen).tolist():
-        begin_ns = int(stamps_ns[runs.first[run]])
-        end_ns = int(stamps_ns[runs.last[run]])
+        begin_ns, end_ns = stamps_ns[[runs.first[run], runs.last[run]]]
         chosen[run] = all(
-            _changes(at_ns, rows, begin_ns, end_ns) for at_ns, rows in others.values()
+            _changes(*others, begin_ns, end_ns)
+            for name, others in rows.items()
+            if name != quantity
         )
     return runs.mask(chosen)
 
@@ -656,12 +636,7 @@ def stuck_quantities(imu: Imu, dvl: Dvl) -> dict[str, Mask]:
         "specific force": (imu.stamps_ns, imu.specific_force),
         "velocity": (dvl.stamps_ns, dvl.velocity),
     }
-    found = {}
-    for quantity, (stamps_ns, values) in rows.items():
-        others = {name: other for name, other in rows.items() if name != quantity}
-        may_rest = quantity == "velocity"
-        found[quantity] = stuck_rows(stamps_ns, values, others, may_rest=may_rest)
-    return found
+    return {name: stuck_rows(name, rows) for name in rows}
 
 
 def stuck_doubt(stamps_ns: Ints, stuck: Mask, quantity: str) -> str | None:
@@ -748,9 +723,7 @@ def is_unfelt(
 def _changes(stamps_ns: Ints, values: Floats, begin_ns: int, end_ns: int) -> bool:
     """True where most rows between two instants differ from the row before."""
     inside = values[(stamps_ns >= begin_ns) & (stamps_ns <= end_ns)]
-    if len(inside) < 2:
-        return False
-    return bool(differing(inside).mean() >= LEAST_CHANGING)
+    return len(inside) > 1 and bool(differing(inside).mean() >= LEAST_CHANGING)
 
 
 def unlikely_zeros(values: Floats, moved: Floats, least: float) -> Mask:
@@ -821,9 +794,7 @@ def repeated_frames(
     """Mask of sightings, shape (n,), whose whole frame repeats the frame before, as of `repeated_sightings`."""
     begins = np.flatnonzero(np.diff(frame, prepend=frame[0] - 1))
     parts = np.split(sightings, begins[1:])
-    differs = np.array(
-        [not np.array_equal(a, b) for a, b in pairwise(parts)], dtype=bool
-    )
+    differs = np.array([not np.array_equal(*two) for two in pairwise(parts)], bool)
     if not differs.any():  # one picture all the time, as in a demonstration
         return np.zeros(len(frame), bool)
     is_stuck = _repeated_while_moving(differs, moved[begins], least)
@@ -857,19 +828,12 @@ def way_by(
         rows = dvl.rows(np.flatnonzero(whole))
         stamps_ns = rows.stamps_ns
         velocity = rows.velocity @ calibration.dvl.mounting.pose().rotation().matrix().T
-        width = (
-            max(1, round(1e9 / float(np.median(np.diff(stamps_ns)))))
-            if len(rows) > 1
-            else 1
-        )
-        width = min(width, len(rows))
-        smooth = np.column_stack(
-            [
-                # without averaging, noise adds up to a distance that was not moved
-                np.convolve(column, np.ones(width) / width, "same")
-                for column in velocity.T
-            ]
-        )
+        step_ns = float(np.median(np.diff(stamps_ns))) if len(rows) > 1 else np.inf
+        width = min(max(1, round(1e9 / step_ns)), len(rows))
+        # without averaging, noise adds up to a distance that was not moved
+        mean = np.ones(width) / width
+        columns = [np.convolve(column, mean, "same") for column in velocity.T]
+        smooth = np.column_stack(columns)
         rate = smooth[:, 2] if role == "depth" else np.linalg.norm(smooth, axis=1)
     steps = (rate[1:] + rate[:-1]) / 2 * np.diff(stamps_ns) * 1e-9
     return np.interp(at_ns, stamps_ns, np.concatenate([[0.0], np.cumsum(steps)]))

@@ -25,14 +25,20 @@ from sonar_graph.logs.adapters import (
 from sonar_graph.logs.cdr import (
     Struct,
     decode,
-    definition,
     parse_definition,
-    short_name,
 )
 from sonar_graph.logs.checks import stamp_faults
-from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, Topic, scan
+from sonar_graph.logs.mcap import (
+    STAMP_BYTES,
+    Keep,
+    Recording,
+    Topic,
+    keeping,
+    scan,
+)
 from sonar_graph.logs.reading import Assembly
 from sonar_graph.logs.roles import (
+    NAVIGATION,
     ROLES,
     SEQUENCE_ROLES,
     SONAR,
@@ -151,17 +157,15 @@ class LogSummary:
     def obstacles(self) -> tuple[str, ...]:
         """Needed roles that no topic plays, or several could, so that no estimator can run; such as ``no IMU``."""
         found = []
-        for role in self.roles:
-            count = len(role.candidates)
-            if role.topic is not None or not ROLES[role.role].is_required:
+        for choice in self.roles:
+            role = choice.role
+            if choice.topic is not None or role not in NAVIGATION:
                 continue
-            if count:
-                choice = f"{role.role}={role.candidates[0]}"
-                found.append(
-                    f"{count} topics for {role.role} (choose: --topic {choice})"
-                )
+            if count := len(choice.candidates):
+                advice = f"--topic {role}={choice.candidates[0]}"
+                found.append(f"{count} topics for {role} (choose: {advice})")
             else:
-                found.append(f"no {role.role.upper()}")
+                found.append(f"no {role.upper()}")
         return tuple(found)
 
     @property
@@ -242,10 +246,9 @@ def inspect_log(
     config = as_log_config(config, call) or LogConfig()
     given = as_calibration(calibration, call)
     wanted = {} if topics is None else topics
-    types = wanted_types(config)
     recording = scan(
         path,
-        lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP,
+        keeping(wanted_types(config), Keep.STAMP),
         as_window(window, call),
     )
     require_topics(recording, wanted, config, call)
@@ -288,7 +291,7 @@ def inspect_log(
         name=recorded_name(recording),
         topics=summaries,
         roles=tuple(
-            RoleSummary(c.role.name, c.topic, c.reason, c.candidates)
+            RoleSummary(c.role, c.topic, c.reason, c.candidates)
             for c in choices.values()
         ),
         calibration=calibrated,
@@ -351,20 +354,19 @@ def _header_stamps(topic: Topic) -> Ints | None:
     is_header = isinstance(kind, Struct) and kind.name == "std_msgs/Header"
     if not is_header or min(topic.stacks, default=0) < STAMP_BYTES:
         return None
-    parts = [
-        (rows, payloads[:, :STAMP_BYTES])
-        for stack in topic.stacks.values()
-        for rows, payloads in stack
-    ]
-    decoded = decode(parse_definition(TIME, definition(TIME)), parts)
-    if decoded.unsound:
-        return None
+    decoded = decode(
+        parse_definition(TIME),
+        [
+            (rows, payloads[:, :STAMP_BYTES])
+            for stack in topic.stacks.values()
+            for rows, payloads in stack
+        ],
+    )
     stamps_ns = np.empty(len(topic), np.int64)
     for group in decoded.groups:
-        stamps_ns[group.rows] = (
-            group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
-        )
-    return stamps_ns
+        seconds = group["sec"].astype(np.int64)
+        stamps_ns[group.rows] = seconds * NS_PER_S + group["nanosec"]
+    return None if decoded.unsound else stamps_ns
 
 
 def starting_config(
@@ -375,7 +377,7 @@ def starting_config(
         f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."
     ]
     for choice in choices:
-        role = choice.role.name
+        role = choice.role
         table = config.table(role)
         named = choice.candidates or choice.could_be
         if choice.topic is not None and choice.adapter is not None:
@@ -388,15 +390,14 @@ def starting_config(
         elif named:
             topics = (f'topic = "{name}"' for name in named)
             parts.append(_comment(f"[{role}]  # one of", *topics))
-        elif choice.role.is_required:
+        elif role in NAVIGATION:
             parts.append(_comment(*_to_fill_in(role, recording)))
         else:
             parts.append(_comment(f"[{role}]  # nothing found"))
     used = {choice.topic for choice in choices}
-    if any(choice.topic is None and choice.role.is_required for choice in choices):
+    if any(choice.topic is None and choice.role in NAVIGATION for choice in choices):
         for topic in recording.topics.values():
-            is_tree = short_name(topic.type_name) == short_name(TF)
-            if topic.name in used or not topic.is_ros2 or is_tree:
+            if topic.name in used or not topic.is_ros2 or topic.is_a(TF):
                 continue
             fields = [f"  {path}{size}" for path, size in _leaves(topic).items()]
             more = len(fields) - _MOST_FIELDS

@@ -11,7 +11,6 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -19,7 +18,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.logs.cdr import Value, definition, encode, parse_definition, short_name
+from sonar_graph.logs.cdr import Value, encode, parse_definition
 from sonar_graph.logs.mcap import (
     LogWriter,
     Recording,
@@ -28,7 +27,7 @@ from sonar_graph.logs.mcap import (
     latched,
     own_schema,
 )
-from sonar_graph.logs.roles import DROPPED, TF, Choice
+from sonar_graph.logs.roles import DROPPED, NAVIGATION, TF, Choice
 from sonar_graph.logs.vehicle_setup import (
     METADATA,
     read_notes,
@@ -48,7 +47,7 @@ NEWEST_FRAMES = "live.newest_frames_ns"
 def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
     """Reasons of the messages that the estimator was not given live, by topic and log time."""
     topic = recording.topics.get(DROPPED_TOPIC)
-    if topic is None or short_name(topic.type_name) != short_name(DROPPED):
+    if topic is None or not topic.is_a(DROPPED):
         return {}
     found = dict[tuple[str, int], str]()
     for group in topic.messages():
@@ -58,9 +57,8 @@ def dropped_in(recording: Recording) -> dict[tuple[str, int], str]:
             group.strings("reason"),
             strict=True,
         )
-        found |= {
-            (name, log_time_ns): reason for (name,), log_time_ns, (reason,) in columns
-        }
+        for (name,), log_time_ns, (reason,) in columns:
+            found[name, log_time_ns] = reason
     return found
 
 
@@ -72,7 +70,7 @@ def leave_out_dropped(recording: Recording) -> dict[str, str]:
         times_ns = topic.log_times_ns
         # a message is named by topic and log time
         gone_ns = [time_ns for name, time_ns in dropped if name == topic.name]
-        is_frames = short_name(topic.type_name) == short_name(TF) and topic.is_latched
+        is_frames = topic.is_a(TF) and topic.is_latched
         if newest_ns.isdecimal() and is_frames:
             gone_ns += times_ns[times_ns > int(newest_ns)].tolist()
         if gone_ns:
@@ -112,7 +110,7 @@ def pinned(
             tables[role] = {"use": False}
         else:
             tables.setdefault(role, {})["topic"] = choice.topic
-    for role in ("imu", "dvl"):
+    for role in NAVIGATION:
         adapter = assembly.adapters[role]
         # single messages must be read as all of the log are
         tables[role] |= adapter.pinned(adapter.table(assembly.topics[role]))
@@ -149,17 +147,11 @@ class LiveRecord:
         self._writer = LogWriter(self._stream)
         self._channels: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
-        self._of_dropped = parse_definition(DROPPED, definition(DROPPED))
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._writer.finish()
         self._stream.close()
 
@@ -224,9 +216,8 @@ class LiveRecord:
             "log_time": log_time_ns,
             "reason": reason,
         }
-        self.write(
-            DROPPED_TOPIC, encode(self._of_dropped, 1, values)[0].tobytes(), arrival_ns
-        )
+        payload = encode(parse_definition(DROPPED), 1, values)[0].tobytes()
+        self.write(DROPPED_TOPIC, payload, arrival_ns)
 
     def flush(self) -> None:
         """Give all that was written to the operating system, where the end of this process loses nothing of it."""

@@ -33,7 +33,6 @@ from sonar_graph.logs.adapters import (
     detection_warnings,
     shipped_like,
 )
-from sonar_graph.logs.cdr import short_name
 from sonar_graph.logs.checks import (
     LEAST_MOVED,
     UNFELT,
@@ -52,15 +51,15 @@ from sonar_graph.logs.checks import (
 )
 from sonar_graph.logs.live_record import LIVE_RATE, leave_out_dropped, recorded_config
 from sonar_graph.logs.mcap import (
-    Keep,
     Progress,
     Recording,
     TimeWindow,
     Topic,
+    keeping,
     scan,
 )
 from sonar_graph.logs.roles import (
-    ROLES,
+    NAVIGATION,
     SEQUENCE_ROLES,
     SONAR,
     Choice,
@@ -252,19 +251,12 @@ def _scanned(
     progress: Progress | None,
 ) -> tuple[Recording, LogConfig]:
     """The messages of a log that may be needed, and the description of its topics: the given one, or its own."""
-
-    def scanned(types: frozenset[str]) -> Recording:
-        def keep(kind: str) -> Keep:
-            return Keep.ALL if short_name(kind) in types else Keep.NONE
-
-        return scan(path, keep, window, progress)
-
     types = wanted_types(config or LogConfig())
-    recording = scanned(types)
+    recording = scan(path, keeping(types), window, progress)
     used = config or recorded_config(recording) or LogConfig()
     # the types of its own topics are known only now
     if not wanted_types(used) <= types:
-        recording = scanned(wanted_types(used))
+        recording = scan(path, keeping(wanted_types(used)), window, progress)
     return recording, used
 
 
@@ -316,8 +308,7 @@ class Assembly:
         self._notes |= {subject: text for subject, text in found.items() if text}
         self._notes |= recording.notes()
         self._missing: dict[str, str] = {}
-        self._unplaced: tuple[str, ...] = ()
-        self._has_tree = False
+        self._unplaced: list[str] = []
         self._is_start_stated = True
         is_described_ = is_described(recording)
         if isinstance(calibration, Calibration):
@@ -341,7 +332,7 @@ class Assembly:
         try:
             self._tables[role] = self.adapters[role].table(topic)
         except LogError:
-            if len(topic) or ROLES[role].is_required:
+            if len(topic) or role in NAVIGATION:
                 raise
             self._dropped[role] = topic.unsound
 
@@ -393,7 +384,6 @@ class Assembly:
                 mountings[name] = mounting
         mounted = mountings.keys() | by_hand
         self._missing = {k: frame for k, frame in frames.items() if k not in mounted}
-        self._has_tree = bool(tree)
         source = "from the log"
         if not is_recorded:
             source = f"{', '.join(sorted(stated))} {source}; else defaults"
@@ -405,7 +395,11 @@ class Assembly:
                 source += f"; not in the tree, taken as base_link: {left}"
         self._notes["log.calibration"] = given.before(source) if given else source
         # a record of this package states what is not zero
-        self._unplaced = () if recorded else tuple(self._missing)
+        if recorded is None:
+            self._unplaced = [
+                unplaced(*missing, has_tree=bool(tree))
+                for missing in self._missing.items()
+            ]
         self.calibration = gathered(given, recorded, mountings)
 
     @property
@@ -426,8 +420,7 @@ class Assembly:
             rows, dropped = adapter.read(self._tables[role], self.setup(role))
         if rows is not None and not self._is_live:
             is_wrong, reason, advice = self._contradicted(role, rows)
-            count = int(np.count_nonzero(is_wrong))
-            if count:
+            if count := int(np.count_nonzero(is_wrong)):
                 text = f"{count} of {len(rows)} rows {reason}: left out{advice}"
                 self._left_out[role] = text
                 dropped = dropped | {reason: count}
@@ -442,17 +435,11 @@ class Assembly:
         none = np.zeros(len(rows), bool)
         imu = self.block("imu") if role != "imu" else None
         if role == "dvl" and imu is not None and self._may_lack_lock:
-            unfelt = (
-                none
-                if rows.velocity.any(axis=1).all()
-                else unfelt_zeros(imu, rows, self.calibration)
-            )
-            advice = "`are_zeros_measured = true` under [dvl] in a log configuration uses them"
-            return unfelt, UNFELT, f"; {advice}"
-        if role not in LEAST_MOVED or imu is None or len(rows) < 2:
-            return none, "", ""
-        dvl = self.block("dvl")
-        if dvl is None:
+            advice = "; `are_zeros_measured = true` under [dvl] in a log configuration uses them"
+            return unfelt_zeros(imu, rows, self.calibration), UNFELT, advice
+        may_be_stuck = role in LEAST_MOVED and len(rows) > 1
+        dvl = self.block("dvl") if may_be_stuck else None
+        if imu is None or dvl is None:
             return none, "", ""
         # a sensor is stuck where it repeats its value while the vehicle moves
         moved = way_by(role, imu, dvl, self.calibration, rows.stamps_ns)
@@ -500,7 +487,7 @@ class Assembly:
         Raises LogError when IMU and DVL are not enough for any estimator, or a message breaks its own rules.
         """
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
-        for role in ("imu", "dvl"):
+        for role in NAVIGATION:
             if blocks[role] is None:
                 raise self._useless(role)
         imu = blocks["imu"]
@@ -568,7 +555,7 @@ class Assembly:
             dvl = self.block("dvl")
             depth = self.block("depth")
             yield from row_doubts(imu, dvl, depth, self.calibration)
-        for role in ("imu", "dvl"):
+        for role in NAVIGATION:
             if (table := self._tables.get(role)) is not None:
                 times_ns = table.topic.log_times_ns
                 for text in stamp_doubts(table.stamps_ns, times_ns):
@@ -576,8 +563,7 @@ class Assembly:
 
     def warnings(self) -> Iterator[str]:
         """Sentences about messages that can be read but look wrong, each after its role."""
-        for role in self._unplaced:
-            yield unplaced(role, self._missing[role], has_tree=self._has_tree)
+        yield from self._unplaced
         for role, table in self._tables.items():
             for text in self.adapters[role].warnings(table):
                 yield f"{role}: {text}"

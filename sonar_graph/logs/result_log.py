@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.logs import viewer_messages as viewer
-from sonar_graph.logs.mcap import Attachment, Outgoing, write_recording
+from sonar_graph.logs.mcap import Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import BODY_FRAME, encode_mountings
 from sonar_graph.logs.writing import (
@@ -67,7 +67,6 @@ def write_result(
     sequence: Sequence,
     estimates: Mapping[str, Estimates],
     about: Mapping[str, str] | None = None,
-    attachments: List[Attachment] = (),
     pictures: List[viewer.Picture] = (),
 ) -> None:
     """Write the estimates and the truth, where there is one, and beside them the layouts of `write_layouts`.
@@ -82,8 +81,6 @@ def write_result(
         Estimates by the name of the estimator.
     about
         Settings and versions, for the metadata record ``sonar_graph_result``.
-    attachments
-        Files to be attached.
     pictures
         Sonar images into which recognised landmarks are drawn.
 
@@ -120,7 +117,7 @@ def write_result(
         "topics": ",".join(sources),
     }
     records = {RESULT_RECORD: record | dict(about or {})}
-    write_recording(Path(path), messages, records, attachments)
+    write_recording(Path(path), messages, records)
     # one layer a topic, whatever the number of its entries
     layers = []
     for topic, entry in {entry.topic: entry for entry in messages}.items():

@@ -13,7 +13,6 @@ from sonar_graph.logs.adapters import (
     TRUTH_WORDS,
     Adapter,
     LogConfig,
-    Shipped,
     shipped_for,
 )
 from sonar_graph.logs.cdr import parse_definition, short_name
@@ -38,45 +37,37 @@ LONGEST = 300
 _DEFAULTS = LogConfig()
 
 
-@dataclass(frozen=True)
-class Role:
-    """A part that a topic can play."""
-
-    name: str
-    shipped: tuple[Shipped, ...]
-    is_required: bool = False
-
-    def may_play(self, topic: Topic) -> bool:
-        """True where a topic's name allows the role: what is called truth is no measurement."""
-        is_truth = any(word in topic.name.lower() for word in TRUTH_WORDS)
-        return self.name in ("truth", "true_landmarks") or not is_truth
-
-    def fits(self, topic: Topic, *, general: bool) -> bool:
-        """True where a topic fits one of the shipped adapters, of those that are general or of the others."""
-        name = topic.name.lower()
-        kind = short_name(topic.type_name)
-        return self.may_play(topic) and any(
-            short_name(offer.adapter.type) == kind
-            and any(word in name for word in offer.words or ("",))
-            for offer in self.shipped
-            if offer.is_general == general
-        )
-
-
-ROLES = {
-    name: Role(name, shipped, is_required=name in ("imu", "dvl"))
-    for name, shipped in SHIPPED.items()
-}
+ROLES = SHIPPED
+"""Adapters by role."""
+NAVIGATION = ("imu", "dvl")
+"""Roles without which nothing is known of the motion but what images show."""
 SEQUENCE_ROLES = tuple(name for name in ROLES if name != SONAR)
 """Roles that make a `Sequence`, called like its fields; sonar images are read by themselves."""
+
+
+def may_play(role: str, topic: Topic) -> bool:
+    """True where a topic's name allows a role: what is called truth is no measurement."""
+    is_truth = any(word in topic.name.lower() for word in TRUTH_WORDS)
+    return role in ("truth", "true_landmarks") or not is_truth
+
+
+def fits(role: str, topic: Topic, *, general: bool) -> bool:
+    """True where a topic fits one of the shipped adapters, of those that are general or of the others."""
+    return may_play(role, topic) and any(
+        topic.is_a(offer.adapter.type)
+        and any(word in topic.name.lower() for word in offer.words or ("",))
+        for offer in ROLES[role]
+        if offer.is_general == general
+    )
 
 
 @dataclass(frozen=True)
 class Choice:
     """The topic that plays a role, or the reason why none does."""
 
-    role: Role
+    role: str
     topic: str | None
+    """None: no topic plays it, or several could."""
     reason: str
     adapter: Adapter | None = None
     """Adapter for its messages."""
@@ -89,21 +80,17 @@ class Choice:
 
     def advice(self) -> str:
         """Advice to choose one of several topics, on the command line, in Python and in a log configuration."""
-        role = self.role.name
         topic = self.candidates[0]
-        return f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
+        in_python = f"(topics={{{self.role!r}: {topic!r}}} in Python, [{self.role}] topic in a log configuration)"
+        return f"--topic {self.role}={topic} {in_python}"
 
 
 def wanted_types(
     config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES
 ) -> frozenset[str]:
     """Types whose messages may be needed, without the ``msg``."""
-    shipped = {
-        short_name(offer.adapter.type)
-        for name in roles
-        for offer in ROLES[name].shipped
-    }
-    return config.types() | shipped | {short_name(TF), short_name(DROPPED)}
+    shipped = [one.adapter.type for name in roles for one in ROLES[name]]
+    return config.types() | set(map(short_name, [*shipped, TF, DROPPED]))
 
 
 def refusal(topic: Topic) -> str | None:
@@ -125,16 +112,16 @@ def refusal(topic: Topic) -> str | None:
     return None
 
 
-def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
+def adapter_for(role: str, topic: Topic, config: LogConfig) -> Adapter | str:
     """Adapter for a topic in a role, or the reason why it is missing."""
     # first what no role can read
     if (reason := refusal(topic)) is not None:
         return reason
-    table = config.table(role.name)
-    if "type" in table and short_name(table["type"]) != short_name(topic.type_name):
+    table = config.table(role)
+    if "type" in table and not topic.is_a(table["type"]):
         return f"is a {topic.type_name}, and {config.source} asks for a {table['type']}"
     lacking: list[str] = []
-    for adapter in config.adapters(role.name, topic.type_name):
+    for adapter in config.adapters(role, topic.type_name):
         lacking = adapter.missing_in(topic.definition())
         if not lacking:
             return adapter.refusal(topic) or adapter
@@ -142,12 +129,12 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
         return f"has no field {', '.join(lacking)}"
     if others := [other for other in ROLES if shipped_for(other, topic.type_name)]:
         roles = " or ".join(others)
-        return f"is a {topic.type_name}; no adapter of role {role.name} reads it, it is a type of role {roles}"
+        return f"is a {topic.type_name}; no adapter of role {role} reads it, it is a type of role {roles}"
     return f"is a {topic.type_name}, for which no adapter is shipped: name type and fields in --log-config"
 
 
 def choose_topic(
-    role: Role,
+    role: str,
     recording: Recording,
     config: LogConfig = _DEFAULTS,
     wanted: str | None = None,
@@ -157,61 +144,55 @@ def choose_topic(
     A topic that the user ``wanted`` goes before that of the configuration, and this before a search by type. A
     configuration that names fields which the messages do not have is refused.
     """
-    table = config.table(role.name)
+    table = config.table(role)
     topics = list(recording.topics.values())
     if table.get("use") is False and wanted is None:
         return Choice(role, None, f"switched off in {config.source}", is_off=True)
     named = wanted or table.get("topic")
     asked = table.get("type")
     if named:
-        searches = [[topic for topic in topics if topic.name == named]]
-        by = "by name" if wanted else f"in {config.source}"
-        choice = _chosen(role, named, searches[0], config, by)
+        found = [topic for topic in topics if topic.name == named]
+        searches = [found]
+        adapter = adapter_for(role, found[0], config) if found else "is not in the log"
+        if isinstance(adapter, str):
+            choice = Choice(role, None, f"{named} was chosen but {adapter}")
+        else:
+            by = "by name" if wanted else f"in {config.source}"
+            choice = Choice(role, named, f"chosen {by}", adapter)
     else:
         # a type that any sensor may send counts only where no other fits
         searches = [
-            [t for t in topics if role.fits(t, general=g)] for g in (False, True)
+            [t for t in topics if fits(role, t, general=g)] for g in (False, True)
         ]
         if asked:
-            kind = short_name(asked)
-            searches = [[t for t in topics if short_name(t.type_name) == kind]]
-        found = (_only(role, config, fitting) for fitting in searches)
-        choice = next(filter(None, found), None) or _none_fits(role, topics, config)
+            searches = [[topic for topic in topics if topic.is_a(asked)]]
+        choices = (_only(role, config, fitting) for fitting in searches)
+        choice = next(filter(None, choices), None) or _none_fits(role, topics, config)
     if table and not choice.candidates:
         for topic in [topic for fitting in searches for topic in fitting]:
             if refusal(topic) is None and choice.topic in (None, topic.name):
-                config.require_fields(role.name, topic.type_name, topic.definition())
+                config.require_fields(role, topic.type_name, topic.definition())
     return choice
 
 
-def _chosen(
-    role: Role, name: str, found: list[Topic], config: LogConfig, by: str
-) -> Choice:
-    """Choice of the topic of a name, where the log has it and it can be read."""
-    adapter = adapter_for(role, found[0], config) if found else "is not in the log"
-    if isinstance(adapter, str):
-        return Choice(role, None, f"{name} was chosen but {adapter}")
-    return Choice(role, name, f"chosen {by}", adapter)
-
-
-def _none_fits(role: Role, topics: list[Topic], config: LogConfig) -> Choice:
+def _none_fits(role: str, topics: list[Topic], config: LogConfig) -> Choice:
     """Choice of no topic, with those that the user may choose by name."""
-    if asked := config.table(role.name).get("type"):
+    if asked := config.table(role).get("type"):
         return Choice(role, None, f"no {asked}, which {config.source} asks for")
     others = tuple(
         topic.name
         for topic in topics
-        if role.may_play(topic)
+        if may_play(role, topic)
         and not isinstance(adapter_for(role, topic, config), str)
     )
-    reason = f"no topic of a known type, such as {role.shipped[0].adapter.type}"
+    reason = f"no topic of a known type, such as {ROLES[role][0].adapter.type}"
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        reason += f"; {others[0]}{more} only if chosen: --topic {role.name}={others[0]}"
+        reason += f"; {others[0]}{more} only if chosen: --topic {role}={others[0]}"
     return Choice(role, None, reason, could_be=others)
 
 
-def _only(role: Role, config: LogConfig, fitting: list[Topic]) -> Choice | None:
+def _only(role: str, config: LogConfig, fitting: list[Topic]) -> Choice | None:
     """Choose the only usable topic of those that fit; None where none fits."""
     usable: dict[str, Adapter] = {}
     reasons = []
@@ -225,7 +206,7 @@ def _only(role: Role, config: LogConfig, fitting: list[Topic]) -> Choice | None:
         reason = f"{len(usable)} topics fit: {', '.join(usable)}"
         return Choice(role, None, reason, candidates=tuple(usable))
     for name, adapter in usable.items():
-        as_told = f", read as {config.source} says" if config.table(role.name) else ""
+        as_told = f", read as {config.source} says" if config.table(role) else ""
         reason = f"the only {adapter.type} that fits{as_told}"
         return Choice(role, name, reason, adapter)
     return Choice(role, None, "; ".join(reasons)) if reasons else None
@@ -313,8 +294,7 @@ def choose_each(
     Of several orientations that of the topic in use as IMU is the heading, with the stamps and axes stated for the IMU.
     """
     choices = {
-        name: choose_topic(ROLES[name], recording, config, wanted.get(name))
-        for name in roles
+        name: choose_topic(name, recording, config, wanted.get(name)) for name in roles
     }
     imu = choices.get("imu")
     heading = choices.get("heading")
@@ -350,7 +330,7 @@ def choose_topics(
     require_roles(wanted)
     choices = choose_each(recording, wanted, config, roles)
     for name, choice in choices.items():
-        is_required = choice.role.is_required
+        is_required = name in NAVIGATION
         if choice.candidates:
             raise LogError(
                 f"{path}: for {name}, {choice.reason}; choose one: {choice.advice()}"
@@ -394,7 +374,7 @@ def _missing(
 
 def images_alone(recording: Recording, config: LogConfig) -> str:
     """Words for the end of a sentence about a log that lacks a role, on what its sonar images are good for."""
-    if choose_topic(ROLES[SONAR], recording, config).topic is None:
+    if choose_topic(SONAR, recording, config).topic is None:
         return ""
     path = recording.path
     return (

@@ -1,6 +1,6 @@
 """Sonar images of a log: their frames, where the sonar is mounted, and the setup of a log that has nothing else."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +16,21 @@ from sonar_graph.logs.adapters import (
     SonarAdapter,
     as_log_config,
 )
-from sonar_graph.logs.mcap import Keep, Recording, TimeWindow, scan, stream
+from sonar_graph.logs.mcap import (
+    Keep,
+    Recording,
+    TimeWindow,
+    keeping,
+    scan,
+    stream,
+)
 from sonar_graph.logs.roles import (
+    NAVIGATION,
     SONAR,
     Window,
     as_window,
     choose_each,
+    choose_topic,
     choose_topics,
 )
 from sonar_graph.logs.vehicle_setup import (
@@ -35,10 +44,6 @@ from sonar_graph.logs.vehicle_setup import (
     static_mounting,
     with_fields,
 )
-
-NAVIGATION = ("imu", "dvl")
-"""Roles without which nothing is known of the motion but what images show."""
-
 
 OF_THE_IMAGES = ("image", "lens", "elevation_aperture_rad")
 """Fields of a sonar's calibration that a recording of images knows better than a log without."""
@@ -67,7 +72,7 @@ def lacking_navigation(
     """
     config = config or LogConfig()
     # types are enough: nothing is decompressed
-    recording = scan(path, lambda _: Keep.NONE, window)
+    recording = scan(path, window=window)
     wanted = {role: topic for role, topic in topics.items() if role in NAVIGATION}
     choices = choose_each(recording, wanted, config, NAVIGATION)
     asked = wanted.keys() | {
@@ -101,13 +106,13 @@ def read_images_alone(
         When the calibration in the log is invalid, or becomes so.
     """
     config = config or LogConfig()
-    recording = scan(path, lambda _: Keep.NONE)
+    recording = scan(path)
     if not salvage:
         recording.require_sound()
-    # the first frame shows whether the images can be read, and when they begin
+    # the first frame shows whether the images can be read, and when they begin; others are named when they are used
     first = next(
         read_sonar_frames(
-            path, topic, config, window=window, salvage=salvage, refused=_passed_over
+            path, topic, config, window=window, salvage=salvage, refused=lambda *_: None
         ),
         None,
     )
@@ -141,26 +146,19 @@ def sonar_frame(
     topic, config
         As for `read_sonar_frames`.
     """
-    choice = choose_each(
-        recording, {SONAR: topic} if topic else {}, config or LogConfig(), (SONAR,)
-    )[SONAR]
+    choice = choose_topic(SONAR, recording, config or LogConfig(), topic)
     if choice.topic is None or choice.adapter is None:
         return None
     images = recording.topics[choice.topic]
     pieces = (
         [images]
         if images.keep is Keep.ALL
-        else stream(recording.path, _keeping(images.type_name), salvage=True)
+        else stream(recording.path, keeping([images.type_name]), salvage=True)
     )
     found = (piece.messages() for piece in pieces if piece.name == choice.topic)
     # the first piece may hold other topics only
     messages = next((groups for groups in found if groups), None)
     return choice.adapter.frame_in(messages) if messages else None
-
-
-def _keeping(type_name: str) -> Callable[[str], Keep]:
-    """Choice of the messages of one type alone."""
-    return lambda name: Keep.ALL if name == type_name else Keep.NONE
 
 
 def joined_calibration(
@@ -174,11 +172,11 @@ def joined_calibration(
     What the user gives goes before both. The sonar's mounting is that of the navigation's record or ``/tf_static``, or
     else that of the images'; without either it stays unstated. ``topic`` is that of the images.
     """
-    known = recorded_fields(navigation)
-    own = recorded_fields(images).get(SONAR, {})
+    known = recorded_fields(navigation) or {}
+    own = (recorded_fields(images) or {}).get(SONAR, {})
     # the sonar's own recording has its lens and scale
     better = {name: own[name] for name in OF_THE_IMAGES if name in own}
-    frame = sonar_frame(scan(images, lambda _: Keep.NONE), topic)
+    frame = sonar_frame(scan(images), topic)
     found = None if frame is None else static_mounting(navigation, frame)
     # the vehicle's tree goes before that of the sonar's own log
     if found is None and frame is not None and "mounting" not in own:
@@ -187,10 +185,6 @@ def joined_calibration(
     return with_fields(
         {SONAR: own | mounting}, known, {SONAR: better}, given.values if given else {}
     )
-
-
-def _passed_over(_stamp_ns: int, _reason: str) -> None:
-    """Messages that are no images are named when the frames are used."""
 
 
 def no_images(log: Path | str, window: TimeWindow | None = None) -> str:
@@ -241,7 +235,7 @@ def read_sonar_frames(
     path = as_path(path, f"{call}(path)")
     config = as_log_config(config, call) or LogConfig()
     part = as_window(window, call)
-    recording = scan(path, lambda _: Keep.NONE)
+    recording = scan(path)
     choice = choose_topics(
         recording, {SONAR: topic} if topic else {}, config, (SONAR,)
     )[SONAR]
@@ -250,7 +244,7 @@ def read_sonar_frames(
     # images of a dive do not fit into memory
     for piece in stream(
         path,
-        _keeping(recording.topics[choice.topic].type_name),
+        keeping([recording.topics[choice.topic].type_name]),
         part,
         salvage=salvage,
     ):

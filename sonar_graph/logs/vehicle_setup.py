@@ -24,12 +24,10 @@ from sonar_graph.files import as_path, text_of
 from sonar_graph.logs.cdr import (
     Bytes,
     Value,
-    definition,
     encode,
     parse_definition,
-    short_name,
 )
-from sonar_graph.logs.mcap import Keep, Recording, earlier_parts, scan
+from sonar_graph.logs.mcap import Recording, earlier_parts, keeping, scan
 from sonar_graph.logs.roles import TF
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in, parse
@@ -71,22 +69,15 @@ def static_frames(recording: Recording) -> FrameTree:
     """
     frames = _frames_in(recording)
     for part in () if frames else earlier_parts(recording.path):
-        frames |= _frames_in(scan(part, _transforms))
+        frames |= _frames_in(scan(part, keeping([TF])))
     return frames
-
-
-def _transforms(kind: str) -> Keep:
-    return Keep.ALL if short_name(kind) == short_name(TF) else Keep.NONE
 
 
 def _frames_in(recording: Recording) -> FrameTree:
     frames: FrameTree = {}
     for topic in recording.topics.values():
-        if (
-            not topic.name.endswith("tf_static")
-            or short_name(topic.type_name) != short_name(TF)
-            or not topic.is_ros2
-        ):
+        is_tree = topic.name.endswith("tf_static") and topic.is_a(TF)
+        if not is_tree or not topic.is_ros2:
             continue
         for group in topic.messages():
             # (messages, transforms, 7)
@@ -199,8 +190,7 @@ def encode_mountings(calibration: Calibration) -> Bytes:
     values: dict[str, Value] = dict(zip(POSE_FIELDS, columns, strict=True))
     values["transforms.header.frame_id"] = BODY_FRAME
     values["transforms.child_frame_id"] = list(MOUNTING_FIELDS)
-    definition_of_tf = parse_definition(TF, definition(TF))
-    return encode(definition_of_tf, 1, values, {"transforms": len(poses)})
+    return encode(parse_definition(TF), 1, values, {"transforms": len(poses)})
 
 
 OTHER_FILES = {"matrix": "--model", "landmark": "--designs", "labels": "--labels"}
@@ -248,14 +238,14 @@ class PartialCalibration:
         """
         if path.suffix == ".mcap":
             try:
-                recorded = read_calibration(scan(path, lambda _: Keep.NONE))
+                recorded = recorded_fields(path)
             except LogError as error:
                 raise CalibrationError(str(error)) from error
             if recorded is None:
                 raise CalibrationError(
                     f"{path}: the log has no calibration; give one that was written by sonar-graph"
                 )
-            return cls(recorded.model_dump(mode="json", exclude_unset=True), str(path))
+            return cls(recorded, str(path))
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
             text = text_of(path)
@@ -280,13 +270,10 @@ class PartialCalibration:
             _over(other.values, self.values), f"{self.source}, else {other.source}"
         )
 
-    def fields(self) -> list[str]:
-        """Paths of the fields that are given, such as ``dvl.mounting.translation_m``."""
-        return list(_paths(self.values))
-
     def before(self, source: str) -> str:
         """Source of a calibration whose fields here go before those of another source."""
-        return f"from {self.source}: {', '.join(self.fields()) or 'nothing'}; else {source}"
+        given = ", ".join(_paths(self.values))
+        return f"from {self.source}: {given or 'nothing'}; else {source}"
 
 
 def as_calibration(
@@ -336,17 +323,17 @@ def recorded_calibration(calibration: Calibration) -> str:
     return calibration.model_dump_json(exclude=exclude)
 
 
-def recorded_fields(path: Path) -> dict[str, Any]:
-    """Fields of a calibration that a log's record states, as JSON has them."""
-    recorded = read_calibration(scan(path, lambda _: Keep.NONE))
-    return (
-        {} if recorded is None else recorded.model_dump(mode="json", exclude_unset=True)
-    )
+def recorded_fields(path: Path) -> dict[str, Any] | None:
+    """Fields of a calibration that a log's record states, as JSON has them; None without one."""
+    recorded = read_calibration(scan(path))
+    if recorded is None:
+        return None
+    return recorded.model_dump(mode="json", exclude_unset=True)
 
 
 def static_mounting(path: Path, frame: str) -> Mounting | None:
     """Mounting of a sensor's frame by a log's ``/tf_static``, or None; errors as of `mounting_of`."""
-    return mounting_of(frame, static_frames(scan(path, _transforms)))
+    return mounting_of(frame, static_frames(scan(path, keeping([TF]))))
 
 
 def with_fields(recorded: Values, *changes: Values) -> str:
@@ -444,7 +431,7 @@ def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
 
     A log that cannot be read, or whose notes are no JSON object, is a LogError.
     """
-    recording = scan(path, lambda _: Keep.NONE)
+    recording = scan(path)
     return recording.metadata.get(METADATA, {}) | {
         "notes": json.dumps(read_notes(recording) | dict(notes))
     }

@@ -266,26 +266,20 @@ class Layer:
 
 
 def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
-    """Write ``NAME.foxglove.json`` and ``NAME.rviz`` beside ``NAME.mcap``; a LogError where one cannot be written."""
-    layout = (
-        json.dumps(foxglove_layout(layers, scene), indent=2, ensure_ascii=False) + "\n"
-    )
-    for suffix, text in (
-        (FOXGLOVE_SUFFIX, layout),
-        (RVIZ_SUFFIX, rviz_config(layers, scene)),
-    ):
-        write_text(result.with_suffix(suffix), text)
+    """Write ``NAME.foxglove.json`` and ``NAME.rviz`` beside ``NAME.mcap``; a LogError where one cannot be written.
+
+    ``rviz2 -d`` opens the latter, with a display for each topic.
+    """
+    layout = json.dumps(foxglove_layout(layers, scene), indent=2, ensure_ascii=False)
+    write_text(result.with_suffix(FOXGLOVE_SUFFIX), f"{layout}\n")
+    rviz = _filled("rviz.jinja", layers, scene)
+    write_text(result.with_suffix(RVIZ_SUFFIX), rviz)
 
 
 def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     """Layout that Foxglove and Lichtblick import: a 3D view, with plots over time and pictures beside it."""
     layout: dict[str, Any] = json.loads(_filled("foxglove.jinja", layers, scene))
     return layout
-
-
-def rviz_config(layers: Sequence[Layer], scene: Scene) -> str:
-    """Configuration that ``rviz2 -d`` opens, with a display for each topic."""
-    return _filled("rviz.jinja", layers, scene)
 
 
 def _filled(template: str, layers: Sequence[Layer], scene: Scene) -> str:

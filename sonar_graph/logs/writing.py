@@ -6,7 +6,6 @@ read back to the bit (docs/design/0004-logs.md).
 
 import json
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,7 @@ from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
 from sonar_graph.logs.cdr import (
     Bytes,
-    Struct,
     Value,
-    definition,
     encode,
     parse_definition,
 )
@@ -333,12 +330,6 @@ def sonar_image_messages(
     return stamped(topic, SONAR_IMAGE, frames.stamps_ns, "sonar", values, lengths)
 
 
-@lru_cache
-def own_definition(type_name: str) -> Struct:
-    """Definition of one of the types that this package writes."""
-    return parse_definition(type_name, definition(type_name))
-
-
 def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
     """Columns of a message's header.
 
@@ -374,7 +365,7 @@ def outgoing(
     is_latched: bool = False,
 ) -> Outgoing:
     """Messages recorded at their stamps; values and lengths as for `encode`."""
-    payloads = encode(own_definition(type_name), len(stamps_ns), values, lengths)
+    payloads = encode(parse_definition(type_name), len(stamps_ns), values, lengths)
     return Outgoing(topic, type_name, stamps_ns, payloads, is_latched)
 
 

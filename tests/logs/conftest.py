@@ -1,6 +1,7 @@
 """Logs and MCAP files written by other libraries than ours, to be read and damaged, and a small sequence."""
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -8,10 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
+from mcap.records import Channel, ChunkIndex, Message, Schema
 from mcap.writer import Writer as ContainerWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.logs.cdr import definition
@@ -36,7 +38,6 @@ TYPES = {
     "odometry": "nav_msgs/msg/Odometry",
     "detections": "sonar_graph_msgs/msg/LandmarkDetections",
     "map": "sonar_graph_msgs/msg/LandmarkMap",
-    "tf": "tf2_msgs/msg/TFMessage",
 }
 Entry = tuple[Any, ...]
 """Topic, type or a word for it, messages, and the definition where it is not the usual one."""
@@ -50,6 +51,21 @@ def header(ns: int, frame_id: str = "sensor") -> dict[str, Any]:
 
 def vector(x: float, y: float, z: float) -> dict[str, float]:
     return {"x": x, "y": y, "z": z}
+
+
+def quaternion(rotation: Rotation) -> dict[str, float]:
+    return dict(zip("xyzw", rotation.as_quat().tolist(), strict=True))
+
+
+def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> Entry:
+    """One frame below the body; what is not given of its quaternion is zero."""
+    turn = dict.fromkeys("xyzw", 0.0) | rotation
+    transform = {
+        "header": header(0, "base_link"),
+        "child_frame_id": link,
+        "transform": {"translation": vector(*xyz), "rotation": turn},
+    }
+    return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [transform]}]
 
 
 class Bench:
@@ -79,21 +95,12 @@ class Bench:
         }
         return message | {"num_good_beams": 4} | other
 
-    def pressure(
-        self, ns: int, pascals: float, variance: float = 0.0
-    ) -> dict[str, Any]:
-        return {
-            "header": header(ns, "pressure_link"),
-            "fluid_pressure": pascals,
-            "variance": variance,
-        }
+    def pressure(self, ns: int) -> dict[str, Any]:
+        return {"header": header(ns, "pressure_link"), "fluid_pressure": 2e5}
 
-    def odometry(self, ns: int, x: float, **other: Any) -> dict[str, Any]:
-        pose = {
-            "position": vector(x, 0, 0),
-            "orientation": {**vector(0, 0, 0), "w": 1.0},
-        }
-        return {"header": header(ns, "map"), "pose": {"pose": pose}} | other
+    def odometry(self, ns: int) -> dict[str, Any]:
+        pose = {"orientation": quaternion(Rotation.identity())}
+        return {"header": header(ns, "map"), "pose": {"pose": pose}}
 
     def detections(
         self, ns: int, ranges: list[float], ids: list[int], track: tuple[int, ...] = ()
@@ -108,17 +115,6 @@ class Bench:
         return message | {
             "id_probability": [min(0.5, len(ranges) / max(len(ids), 1))] * len(ids),
             "track": list(track),
-        }
-
-    def transform(
-        self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0
-    ) -> dict[str, Any]:
-        rotation = {**vector(0, 0, np.sin(yaw_rad / 2)), "w": np.cos(yaw_rad / 2)}
-        moved = {"translation": vector(*xyz), "rotation": rotation}
-        return {
-            "header": header(0, parent),
-            "child_frame_id": child,
-            "transform": moved,
         }
 
     def basics(self, samples: int = 5) -> list[Entry]:
@@ -153,12 +149,12 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
-def decode(path: Path) -> dict[str, list[Any]]:
-    """Messages of a log by topic, as mcap-ros2-support reads them."""
+def decode(path: Path, *topics: str) -> dict[str, list[Any]]:
+    """Messages of a log, or of some topics, by topic, as mcap-ros2-support reads them."""
     found: dict[str, list[Any]] = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages():
+        for _, channel, _, message in reader.iter_decoded_messages(topics or None):
             found.setdefault(channel.topic, []).append(message)
     return found
 
@@ -270,6 +266,37 @@ def write(
             writer.add_message(channel, time_ns, payload, time_ns)
             writer.add_message(silent, time_ns, b'{"a": 1}', time_ns)
     return written
+
+
+Change = Callable[[str, int, bytes], bytes | None]
+"""Payload in a copy, of a message by topic, number and payload; None: it is left out."""
+
+
+def recorded(path: Path) -> list[tuple[Schema | None, Channel, Message]]:
+    with path.open("rb") as stream:
+        return list(make_reader(stream).iter_messages())
+
+
+def copy(
+    messages: Iterable[tuple[Schema | None, Channel, Message]],
+    writer: ContainerWriter,
+    change: Change = lambda *message: message[-1],
+) -> None:
+    """Write messages of a log into another file, without its metadata."""
+    seen = Counter[str]()
+    channels: dict[str, int] = {}
+    for schema, channel, message in messages:
+        topic = channel.topic
+        data = change(topic, seen[topic], message.data)
+        seen[topic] += 1
+        if topic not in channels and schema is not None:
+            kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[topic] = writer.register_channel(
+                topic, channel.message_encoding, kind, channel.metadata
+            )
+        if data is not None:
+            times = (message.publish_time, message.sequence)
+            writer.add_message(channels[topic], message.log_time, data, *times)
 
 
 def write_apart(path: Path, count: int = 100) -> None:

@@ -13,9 +13,8 @@ from mcap_ros2._dynamic import generate_dynamic
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Struct, decode, encode, parse_definition
-from sonar_graph.logs.cdr.definitions import STRING
 
-from .random_schemas import Tally, check, stacked
+from .random_schemas import check, stacked
 
 NAME = "test_msgs/msg/Root"
 RULE = "=" * 80
@@ -42,40 +41,14 @@ def column(groups: Any, path: str) -> dict[int, Any]:
 # ---- definitions
 
 
-def test_constants_comments_defaults_and_bounds_are_understood() -> None:
-    text = """# a comment with a field-like line: float64 no
-    uint8 A=1
-    string NAME = "with # sign"
-    float64 x 1.5   # a default
-    string<=10 s
-    int32[<=4] bounded
-    int32[4] fixed
-    float32[] open
-    """
-    fields = [(f.name, f.kind, f.length, f.is_array) for f in parsed(text).fields]
-    assert fields[:2] == [("x", "float64", 1, False), ("s", STRING, 1, False)]
-    assert fields[2:] == [
-        ("bounded", "int32", None, True),
-        ("fixed", "int32", 4, True),
-        ("open", "float32", None, True),
-    ]
-    for own in (
-        "Part",
-        "test_msgs/Part",
-        "test_msgs/msg/Part",
-    ):  # of the own package, with or without a prefix
-        part, stamp = parsed(
-            f"{own} part\nbuiltin_interfaces/Time stamp", Part="float64 x"
-        ).fields
-        assert (part.kind.name, stamp.kind.name) == (
-            "test_msgs/Part",
-            "builtin_interfaces/Time",
-        )
-        # needs no definition
-        assert [f.name for f in stamp.kind.fields] == [
-            "sec",
-            "nanosec",
-        ]
+@pytest.mark.parametrize("own", ["Part", "test_msgs/Part", "test_msgs/msg/Part"])
+def test_types_of_the_own_package_need_no_prefix_and_a_time_no_definition(
+    own,
+):
+    text = f"{own} part\nbuiltin_interfaces/Time stamp"
+    part, stamp = parsed(text, Part="float64 x").fields
+    assert part.kind.name == "test_msgs/Part"
+    assert [f.name for f in stamp.kind.fields] == ["sec", "nanosec"]
 
 
 def doubling(levels: int) -> str:
@@ -107,7 +80,7 @@ REFUSED = {
 }
 
 
-def test_a_definition_that_cannot_be_understood_is_refused_and_named() -> None:
+def test_a_definition_that_cannot_be_understood_is_refused_and_named():
     assert len(parse_definition(NAME, doubling(8)).fields) == 1
     for text, message in REFUSED.items():
         with pytest.raises(LogError, match=message):
@@ -122,28 +95,12 @@ def test_a_definition_that_cannot_be_understood_is_refused_and_named() -> None:
     [(40, 5, 1000), pytest.param(300, 10, 0, marks=pytest.mark.slow)],
 )
 def test_random_messages_decode_and_encode_as_with_two_other_libraries(
-    schemas: int, messages: int, seed: int
-) -> None:
-    tally = check(schemas, messages, seed)
-    assert tally == Tally(schemas * messages * 2)  # in both byte orders
+    schemas, messages, seed
+):
+    assert check(schemas, messages, seed) == schemas * messages * 2
 
 
-def test_any_layout_and_byte_order_gives_the_same_columns() -> None:
-    splits = [(i, j) for i in range(1, 40) for j in range(1, 41 - i)] * 2
-    lists = [["x" * i, "y" * j, "z" * (41 - i - j)] for i, j in splits]
-    definition = parsed("string[] names\nfloat64 a")
-    values = [{"names": names, "a": float(row)} for row, names in enumerate(lists)]
-    groups = decode(
-        definition,
-        stacked([encode(definition, 1, value)[0].tobytes() for value in values]),
-    ).groups
-    names = {
-        row: found
-        for g in groups
-        for row, found in zip(g.rows.tolist(), g.strings("names"), strict=True)
-    }
-    assert names == dict(enumerate(lists))
-    assert column(groups, "a") == {row: float(row) for row in range(len(lists))}
+def test_payloads_of_one_length_differ_in_layout_and_byte_order():
     sizes = [(4 * i, 160 - 4 * i) for i in range(41) for _ in "<>"]
     payloads = [
         bytes([0, order == "<", 0, 0])
@@ -154,7 +111,7 @@ def test_any_layout_and_byte_order_gives_the_same_columns() -> None:
     assert column(groups, "c") == {row: row for row in range(82)}
 
 
-def test_what_does_not_fit_or_exist_is_neither_written_nor_read() -> None:
+def test_what_does_not_fit_or_exist_is_neither_written_nor_read():
     definition = parsed("uint8 a\nint32[] b\nP[] points", P="int16 x\nstring s")
     assert encode(definition, 2, {"a": np.array([0, 255])})[:, 4].tolist() == [0, 255]
     for values in (
@@ -169,8 +126,6 @@ def test_what_does_not_fit_or_exist_is_neither_written_nor_read() -> None:
     with pytest.raises(ValueError, match="nonsense"):
         encode(definition, 1, {"nonsense": 1.0})
     (group,) = decode(definition, [(np.arange(2), encode(definition, 2, {}))]).groups
-    with pytest.raises(KeyError):
-        group["nonsense"]
     # a field within an empty sequence is there, without values
     assert (group["points.x"].shape, group["points.x"].dtype) == ((2, 0), np.int16)
     assert (group.strings("points.s"), group.first_string("points.s")) == ([[], []], "")
@@ -224,9 +179,7 @@ BROKEN: dict[str, tuple[bytes, str]] = {
 
 @pytest.mark.parametrize("kind", BROKEN)
 @pytest.mark.parametrize("place", [0, 1, 3], ids=["first", "among", "last"])
-def test_a_broken_message_is_named_and_those_around_it_are_read(
-    kind: str, place: int
-) -> None:
+def test_a_broken_message_is_named_and_those_around_it_are_read(kind, place):
     payload, fault = BROKEN[kind]
     payloads = [whole(last=i) for i in range(3)]
     payloads.insert(place, payload)
@@ -240,8 +193,8 @@ def test_a_broken_message_is_named_and_those_around_it_are_read(
 
 @given(st.binary(max_size=80), st.integers(0, 46), st.integers(0, 46))
 def test_no_bytes_crash_and_what_is_sound_is_what_another_library_reads(
-    noise: bytes, start: int, end: int
-) -> None:
+    noise, start, end
+):
     payload = whole()[:start] + noise + whole()[end:]
     decoded = decode(DEFINITION, stacked([payload]))
     assert len(decoded.groups) + len(decoded.unsound) == 1
@@ -283,14 +236,16 @@ MANY: dict[str, tuple[Struct, list[bytes]]] = {
 
 
 @pytest.mark.parametrize(("definition", "payloads"), MANY.values(), ids=MANY)
-def test_many_broken_messages_are_read_in_seconds(
-    definition: Struct, payloads: list[bytes]
-) -> None:
+def test_many_broken_messages_are_read_in_seconds(definition, payloads):
     stacks = stacked(payloads)
     start = time.process_time()
     decoded = decode(definition, stacks)
     assert time.process_time() - start < 3.0
-    assert definition is not NAMES or (len(stacks), len(decoded.groups)) == (1, 12_000)
+    if definition is NAMES:
+        assert (len(stacks), len(decoded.groups)) == (1, 12_000)
+        for group in decoded.groups:
+            (names,) = group.strings("names")
+            assert [len(name) + 1 for name in names] == LENGTHS[group.rows[0]]
     assert definition is not ENDLESS or list(decoded.unsound) == [
         "that end before their definition does"
     ]

@@ -2,18 +2,17 @@
 
 import contextlib
 import os
-import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, DataEnd, Header
 
-from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
@@ -21,9 +20,9 @@ from sonar_graph.logs import PartialCalibration, inspect_log, read_log
 from sonar_graph.logs.cdr import parse_definition
 from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
-from sonar_graph.logs.roles import TF
-from sonar_graph.logs.vehicle_setup import encode_mountings
-from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
+from sonar_graph.logs.writing import imu_messages
+
+from .conftest import tree
 
 LIMIT = 1 << 16
 PACK: dict[str, Callable[[bytes], bytes]] = {
@@ -35,19 +34,11 @@ PACK: dict[str, Callable[[bytes], bytes]] = {
 
 def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> Path:
     packed = PACK[compression](content)
-    letters = compression.encode()
-    head = (
-        struct.pack("<QQQII", 1, 2, size, 0, len(letters))
-        + letters
-        + struct.pack("<Q", len(packed))
-    )
-    chunk = struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed
-    path.write_bytes(
-        MCAP_MAGIC
-        + struct.pack("<BQII", 1, 8, 0, 0)
-        + chunk
-        + struct.pack("<BQI", 15, 4, 0)
-    )
+    builder = RecordBuilder()
+    Header(profile="", library="").write(builder)
+    Chunk(compression, packed, 1, 1, 0, size).write(builder)
+    DataEnd(0).write(builder)
+    path.write_bytes(MCAP_MAGIC + builder.end())
     return path
 
 
@@ -57,12 +48,12 @@ def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> P
     [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)],
 )
 def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    compression: str,
-    size: int,
-    stated: int,
-) -> None:
+    tmp_path,
+    monkeypatch,
+    compression,
+    size,
+    stated,
+):
     monkeypatch.setattr(chunks, "LARGEST_BYTES", LIMIT)
     path = log_with_chunk(tmp_path / "log.mcap", bytes(size), compression, stated)
     (loss,) = scanning.scan(path, lambda _: Keep.ALL).damage.losses
@@ -76,8 +67,8 @@ def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
 
 
 def test_messages_far_larger_than_their_file_are_refused(
-    tmp_path: Path, monkeypatch: Any, make_sequence: Any
-) -> None:
+    tmp_path, monkeypatch, make_sequence
+):
     write_recording(
         tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {}
     )
@@ -92,9 +83,7 @@ def test_messages_far_larger_than_their_file_are_refused(
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(
-    tmp_path: Path, kind: str
-) -> None:
+def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(tmp_path, kind):
     path = tmp_path / "in.mcap"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
     for read in (read_log, inspect_log):
@@ -107,7 +96,7 @@ def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(
         PartialCalibration.read(path)
 
 
-def test_a_text_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
+def test_a_text_that_is_too_large_is_refused_unread(tmp_path):
     path = tmp_path / "a.toml"
     path.touch()
     os.truncate(path, LARGEST_TEXT + 1)  # without a block on the disk
@@ -120,47 +109,26 @@ TRANSLATION = "numbers that are not finite"
 
 
 @pytest.mark.parametrize(
-    ("of", "value", "message"),
+    ("x_m", "w", "message"),
     [
-        ("rotation", np.nan, TRANSLATION),
-        ("rotation", np.inf, TRANSLATION),
-        ("rotation", 0.0, ROTATION + "0"),
-        ("translation", 1e300, r"dvl: is .* m from base_link"),
-        ("translation", 350.0, r"dvl: is .* m from base_link: millimetres"),
+        (0.0, np.nan, TRANSLATION),
+        (0.0, np.inf, TRANSLATION),
+        (0.0, 0.0, ROTATION + "0"),
+        (1e300, 1.0, r"dvl_link: is .* m from base_link"),
+        (350.0, 1.0, r"dvl_link: is .* m from base_link: millimetres"),
     ],
 )
 def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
-    make_sequence: Any, tmp_path: Path, of: str, value: float, message: str
-) -> None:
-    sequence = make_sequence()
-    path = tmp_path / "log.mcap"
-    payload = bytearray(encode_mountings(Calibration())[0].tobytes())
-    ends = [
-        at
-        for at in range(4, len(payload) - 8, 4)
-        if struct.unpack_from("<d", payload, at)[0] == 1.0 and at % 8 == 4
-    ]
-    # of the second transform, the Doppler log's: x, y, z, then the quaternion's x, y, z, w
-    w = ends[1]
-    for at in (w - 24, w - 16, w - 8, w) if of == "rotation" else (w - 48,):
-        struct.pack_into("<d", payload, at, value)
-    tree = static_message(
-        "/tf_static", TF, 0, np.frombuffer(bytes(payload), np.uint8)[None]
-    )
-    write_recording(
-        path,
-        [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)],
-        {},
-    )
-    with pytest.raises(
-        LogError, match=rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"
-    ):
+    bench, x_m, w, message
+):
+    path = bench.write(*bench.basics(), tree("dvl_link", (x_m, 0, 0), w=w))
+    pattern = rf"log\.mcap: dvl: /tf_static: .*{message}.*--calibration"
+    with pytest.raises(LogError, match=pattern):
         read_log(path)
     assert any("--calibration" in text for text in inspect_log(path).unusable)
     stated = PartialCalibration.parse({"dvl": {"mounting": {}}}, "vehicle.toml")
-    assert read_log(
-        path, calibration=stated
-    ).calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
+    calibration = read_log(path, calibration=stated).calibration
+    assert calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
 
 
 SLOW: dict[str, str] = {
@@ -174,8 +142,8 @@ SLOW: dict[str, str] = {
 
 @pytest.mark.parametrize("text", SLOW.values(), ids=SLOW)
 def test_definitions_are_parsed_in_a_time_that_grows_with_their_length(
-    text: str,
-) -> None:
+    text,
+):
     began = time.process_time()
     for kind in ("p/msg/A", "p/msg/B"):
         for _ in range(5):

@@ -19,7 +19,8 @@ from mcap.writer import CompressionType, IndexType
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs import read_log
-from sonar_graph.logs.mcap import Damage, Instant, Keep, TimeWindow, scan, seal, stream
+from sonar_graph.logs.mcap import Damage, Instant, Keep, TimeWindow, scan, stream
+from sonar_graph.logs.mcap.log_file import seal
 
 from .conftest import (
     Stored,
@@ -76,9 +77,7 @@ CONTAINERS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("options", CONTAINERS.values(), ids=CONTAINERS)
-def test_every_message_is_found_whatever_the_container(
-    path: Path, options: dict[str, Any]
-) -> None:
+def test_every_message_is_found_whatever_the_container(path, options):
     written = write(path, **options)
     assert read(path) == written
     calls: list[tuple[int, int]] = []
@@ -97,13 +96,8 @@ def test_every_message_is_found_whatever_the_container(
     assert len(recording.topics["/bytes"]) == len(written)
     # only the stamps were wanted
     assert list(recording.topics["/bytes"].stacks) == [12]
-    assert calls == sorted(calls)
+    assert calls == sorted(calls) != []
     assert {total for _, total in calls} <= {path.stat().st_size}
-    assert (
-        len(calls) == len(chunk_indexes(path))
-        or "use_chunking" in options
-        or "index_types" in options
-    )
     pieces: dict[str, list[Stored]] = {}
     for piece in stream(path, lambda _: Keep.ALL):
         pieces.setdefault(piece.name, []).extend(entries(piece))
@@ -192,21 +186,12 @@ ENDING = "does not end as an MCAP file"
 TWICE = r"schema 1 \(test_msgs/msg/Bytes\) is described in two ways; the first holds"
 FAULTS = {
     "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
-    "a bit in a chunk without compression": Fault(
-        in_chunk(1, 900), 1, SECOND, "", PLAIN
-    ),
     "a chunk's opcode": Fault(in_chunk(1, 0, 0x80)),
     "a chunk's size beyond all memory": Fault(huge_size, 1, SECOND),
     "both lengths of a chunk": Fault(both_lengths, None, "", "", PLAIN),
     "bytes missing": Fault(missing_in_chunk(1, 1500), 1, "no valid record", MOVED),
-    "the same without compression": Fault(
-        missing_in_chunk(1, 1500), 1, "no valid record", MOVED, PLAIN
-    ),
     "the first chunk, with the descriptions": Fault(
         in_chunk(0, 100), 0, "chunk 1 is lost"
-    ),
-    "bytes missing in the first chunk": Fault(
-        missing_in_chunk(0, 10), 0, "no valid record", MOVED
     ),
     "a message index": Fault(in_index(15), None, "", "", PLAIN),
     "a longer message outside chunks": Fault(
@@ -218,9 +203,6 @@ FAULTS = {
     "a type's name outside chunks": Fault(
         at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE
     ),
-    "a topic's name outside chunks": Fault(
-        at_text(b"/bytes"), None, "", r"channel 1 \(/bytes\) is desc", LOOSE
-    ),
     # it claims 29 bytes and has 13
     "a length in a description": Fault(
         at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED
@@ -229,8 +211,6 @@ FAULTS = {
         at_text(b"sonar_graph", -12, 64), None, "no valid record; no messages lost"
     ),
     "zeros after the end": Fault(tail(bytes(5000)), None, "", ENDING),
-    "opcodes after the end": Fault(tail(b"\x05" * 5000), None, "", ENDING),
-    "noise after the end": Fault(tail(bytes(range(256)) * 20), None, "", ENDING),
 } | {
     f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit))
     for at in (1, 2, 5, 8)
@@ -239,9 +219,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(
-    path: Path, name: str
-) -> None:
+def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path, name):
     fault = FAULTS[name]
     written = write(path, **fault.options)
     chunks = chunk_indexes(path)
@@ -277,7 +255,7 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(
         assert loss.messages == (None if fault.remark == MOVED else counted)
         with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: .*--salvage"):
             recording.require_sound()
-    if name.startswith("a bit in a chunk"):
+    if name == "a bit in a chunk":
         assert loss.end == chunk_end(chunks[1])
         assert (loss.start_ns or 0) <= chunks[1].message_start_time
         assert chunks[1].message_end_time <= (loss.end_ns or 0)
@@ -300,8 +278,8 @@ RANDOM = settings(
 @example("remove", 0.859375, 1209)
 @pytest.mark.parametrize("compression", [ZSTD, NONE])
 def test_no_damage_makes_up_a_message_or_loses_one_silently(
-    path: Path, compression: CompressionType, how: str, part: float, count: int
-) -> None:
+    path, compression, how, part, count
+):
     written = write(path, 200, compression=compression)
     content = path.read_bytes()
     at = 8 + int(part * (len(content) - 9))
@@ -328,8 +306,8 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
 
 
 def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
-    path: Path,
-) -> None:
+    path,
+):
     """Without a CRC that could be checked, those of an uncompressed chunk are no messages outside chunks either."""
     write(path, chunk_size=1 << 20, compression=NONE)
     (chunk,) = chunk_indexes(path)
@@ -350,8 +328,8 @@ def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
 
 
 def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
-    path: Path,
-) -> None:
+    path,
+):
     for options, named in (
         (
             {"use_chunking": False},
@@ -385,21 +363,11 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
 
 
 def test_a_truncated_file_is_read_up_to_the_cut(
-    path: Path,
-) -> None:
+    path,
+):
     written = write(path)
     chunks = chunk_indexes(path)
     content = path.read_bytes()
-    for kept in (0.3, 0.6, 0.8):
-        path.write_bytes(content[: int(len(content) * kept)])
-        found = read(path)
-        recording = scan_all(path)
-        assert 0 < len(found) < len(written)
-        assert found == written[: len(found)]
-        assert re.search(
-            r"^the file is cut off: .* spans 0\.000 s$", recording.ending or ""
-        )
-        recording.require_sound()
     path.write_bytes(content[: chunk_end(chunks[-1])])
     assert (scan_all(path).ending or "").startswith(
         "the file is cut off: it ends after a whole record"
@@ -417,9 +385,7 @@ def test_a_truncated_file_is_read_up_to_the_cut(
 
 
 @pytest.mark.parametrize("compression", [ZSTD, LZ4, NONE])
-def test_half_a_chunk_gives_its_whole_messages(
-    path: Path, compression: CompressionType
-) -> None:
+def test_half_a_chunk_gives_its_whole_messages(path, compression):
     written = write(path, 12_000, chunk_size=1 << 18, compression=compression)
     second = chunk_indexes(path)[1]
     before = int(
@@ -476,7 +442,7 @@ OTHER_FILES = {
 }
 
 
-def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
+def test_other_files_are_named_for_what_they_are(tmp_path):
     path = tmp_path / "log.bag"
     for content, kind in OTHER_FILES.items():
         path.write_bytes(content)
@@ -497,7 +463,7 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
             scan_all(path)
 
 
-def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -> None:
+def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path):
     write_apart(path)
     recording = scan_all(path, TimeWindow(Instant.parse("10"), Instant.parse("20")))
     times_s = sorted(
@@ -533,8 +499,8 @@ BEGINNING_NS = 1_700_000_000_000_000_001
     ],
 )
 def test_a_window_takes_seconds_and_dates_and_refuses_all_else(
-    text: str,
-) -> None:
+    text,
+):
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
     zoned = Instant.parse("1970-01-02T01:00:01.5+01:00")
     assert zoned.resolve(BEGINNING_NS) == 86_401_500_000_000

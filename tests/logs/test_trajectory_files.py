@@ -44,18 +44,17 @@ def test_landmarks_come_back_from_their_table_and_an_empty_map_is_a_header(tmp_p
     root = rng.normal(size=(3, 3, 3))
     covariances = root + root.transpose(0, 2, 1)
     covariances[1] = np.nan
-    columns = np.array([1, 6, 2**40]), rng.normal(size=(3, 3)), covariances
-    for count in (3, 0):
-        landmarks = LandmarkMap(*(column[:count] for column in columns))
-        write_landmarks_csv(tmp_path / "l.csv", landmarks)
-        header, *lines = (tmp_path / "l.csv").read_text().splitlines()
-        assert header == "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
-        assert [float(line.split(",")[8]) for line in lines[:1]] == covariances[
-            : min(count, 1), 1, 2
-        ].tolist()
-        rows = [line.split(",") for line in lines]
-        assert [int(row[0]) for row in rows] == landmarks.ids.tolist()
-        numbers = np.array([row[1:] for row in rows], float).reshape(-1, 9)
-        np.testing.assert_array_equal(numbers[:, :3], landmarks.positions)
-        upper = landmarks.covariances[:, *np.triu_indices(3)]
-        np.testing.assert_array_equal(numbers[:, 3:], upper)
+    landmarks = LandmarkMap(
+        np.array([1, 6, 2**40]), rng.normal(size=(3, 3)), covariances
+    )
+    path = tmp_path / "l.csv"
+    write_landmarks_csv(path, landmarks)
+    header, *lines = path.read_text().splitlines()
+    assert header == "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
+    ids, *columns = np.array([line.split(",") for line in lines]).T
+    assert ids.astype(int).tolist() == landmarks.ids.tolist()
+    upper = covariances[:, *np.triu_indices(3)]
+    expected = np.hstack([landmarks.positions, upper]).T
+    np.testing.assert_array_equal(np.array(columns, float), expected)
+    write_landmarks_csv(path, LandmarkMap.empty())
+    assert path.read_text() == f"{header}\n"

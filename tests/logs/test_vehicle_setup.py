@@ -1,7 +1,5 @@
 """Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
 
-from dataclasses import replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +23,16 @@ from sonar_graph.logs import (
     read_log,
     sonar_image_messages,
 )
-from sonar_graph.logs.mcap import write_recording
+from sonar_graph.logs.mcap import Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import encode_mountings, gathered, mounting_of
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
+from sonar_graph.settings import flattened, nested
+
+from .conftest import tree
 
 TREE_M = (1.0, 2.0, 3.0)
+T0_NS = 1_700_000_000_000_000_000
 FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
 
 
@@ -43,9 +45,11 @@ def written(
     sequence: Any,
     tree: Calibration | None,
     record: dict[str, str] | None = None,
+    *more: Outgoing,
 ) -> Path:
     """A log of IMU and DVL with the mountings of a calibration and a metadata record."""
     messages = [imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)]
+    messages += more
     if tree is not None:
         messages.insert(0, static_message("/tf_static", TF, 0, encode_mountings(tree)))
     write_recording(path, messages, {METADATA: record} if record else {})
@@ -55,10 +59,8 @@ def written(
 # --- mountings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
-    make_sequence: Any, tmp_path: Path
-) -> None:
-    sequence = replace(make_sequence(), detections=None)
+def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(make_sequence, tmp_path):
+    sequence = make_sequence()
     mounting = Mounting(rpy_rad=(0.0, 0.5, 0.0))
     frames = SonarFrames(
         sequence.imu.stamps_ns[:2],
@@ -66,18 +68,9 @@ def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(
         np.arange(1.0, 5),
         np.array([0.1, 0.0, -0.1]),
     )
-    messages = [
-        static_message(
-            "/tf_static",
-            TF,
-            0,
-            encode_mountings(Calibration(sonar=SonarCalibration(mounting=mounting))),
-        ),
-        imu_messages("/imu", sequence.imu),
-        dvl_messages("/dvl", sequence.dvl),
-        sonar_image_messages("/sonar/image", frames),
-    ]
-    write_recording(tmp_path / "a.mcap", messages, {})
+    tree = Calibration(sonar=SonarCalibration(mounting=mounting))
+    images = sonar_image_messages("/sonar/image", frames)
+    written(tmp_path / "a.mcap", sequence, tree, None, images)
     found = read_log(tmp_path / "a.mcap")
     np.testing.assert_allclose(
         found.calibration.sonar.mounting.rpy_rad, mounting.rpy_rad, atol=1e-12
@@ -105,6 +98,7 @@ NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsa
         "dvl", {"base_link": ("base_footprint", BELOW), "dvl": ("base_link", STEP)}, STEP),
     "a footprint that carries both": (
         "dvl", {"base_link": ("base_footprint", BELOW), "dvl": ("base_footprint", STEP)}, BELOW.inverse() * STEP),
+    "a frame in between": ("dvl", {"dvl": ("arm", STEP), "arm": ("base_link", BELOW)}, BELOW * STEP),
     "two vehicles": (
         "b/dvl", {"a/dvl": ("a/base_link", BELOW), "b/dvl": ("b/base_link", STEP)}, STEP),
     "a faulty transform above the body": (
@@ -116,63 +110,34 @@ NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsa
     ("frame", "frames", "body_T_sensor"), NAMED_TREES.values(), ids=NAMED_TREES
 )
 def test_a_frame_is_found_below_the_body_of_any_name(
-    frame: str,
-    frames: dict[str, tuple[str, gtsam.Pose3 | str]],
-    body_T_sensor: gtsam.Pose3,
-) -> None:
+    frame,
+    frames,
+    body_T_sensor,
+):
     found = mounting_of(frame, frames)
     assert found is not None
     assert found.pose().equals(body_T_sensor, 1e-12)
 
 
-def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench: Any) -> None:
-    imu, dvl = bench.basics(20)
-    tree = {"transforms": [bench.transform("base_link", "dvl_link", (1, 2, 3))]}
-    bench.write(imu, dvl, ("/tf_static", "tf", [tree]), name="dive_0.mcap")
-    bench.t0_ns += 2 * 10**9
-    later = (
-        [bench.dvl(bench.t0_ns + i * 10**8) for i in range(20)],
-        [bench.imu(bench.t0_ns + i * 10**8) for i in range(20)],
-    )
-    second = bench.write(
-        ("/dvl", "dvl", later[0]), ("/imu", "imu", later[1]), name="dive_1.mcap"
-    )
-    assert read_log(second).calibration.dvl.mounting.translation_m == (1, 2, 3)
-    bench.t0_ns += 3600 * 10**9
-    later = (
-        [bench.dvl(bench.t0_ns + i * 10**8) for i in range(20)],
-        [bench.imu(bench.t0_ns + i * 10**8) for i in range(20)],
-    )
-    another = bench.write(
-        ("/dvl", "dvl", later[0]), ("/imu", "imu", later[1]), name="dive_2.mcap"
-    )
-    assert read_log(another).calibration.dvl.mounting == Mounting(), (
-        "an hour later: another recording"
-    )
-
-
-def test_mountings_come_from_tf_static_through_frames_in_between(
-    bench: Any,
-) -> None:
-    first = bench.transform("base_link", "frame", (1, 0, 0), np.pi / 2)
-    second = bench.transform("frame", "imu_link", (0.5, 0, 0), np.pi / 2)
-    log = bench.write(
-        *bench.basics(),
-        ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}]),
-    )
-    sequence = read_log(log)
-    # half a metre along the frame's x, which points along the body's y
-    np.testing.assert_allclose(
-        sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12
-    )
-    np.testing.assert_allclose(
-        np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12
-    )
-    assert sequence.calibration.dvl == Calibration().dvl
-    assert (
-        "mountings from /tf_static: imu (imu_link); not in the tree"
-        in sequence.notes["log.calibration"]
-    )
+def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench):
+    topic, kind, messages = tree("dvl_link", TREE_M, w=1.0)
+    mountings = []
+    # two seconds after the first file, and an hour later: another recording
+    for number, later_s in enumerate((0, 2, 3602)):
+        bench.t0_ns = T0_NS + later_s * 10**9
+        stamps_ns = [bench.t0_ns + i * 10**8 for i in range(20)]
+        topics = [
+            ("/dvl", "dvl", [bench.dvl(ns) for ns in stamps_ns]),
+            ("/imu", "imu", [bench.imu(ns) for ns in stamps_ns]),
+            (topic, kind, [] if number else messages),
+        ]
+        path = bench.write(*topics, name=f"dive_{number}.mcap")
+        found = read_log(path)
+        mountings.append(found.calibration.dvl.mounting.translation_m)
+        placed = "none; not" if later_s == 3602 else "dvl (dvl_link); not"
+        said = f"defaults; mountings from /tf_static: {placed} in the tree, taken as"
+        assert found.notes["log.calibration"].startswith(said)
+    assert mountings == [TREE_M, TREE_M, (0, 0, 0)]
 
 
 # --- precedence -----------------------------------------------------------------------------------------------------
@@ -191,35 +156,12 @@ FIELDS = {
 SOME = st.fixed_dictionaries({}, optional=FIELDS)
 
 
-def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    found = {}
-    for name, value in values.items():
-        found |= (
-            leaves(value, f"{prefix}{name}.")
-            if isinstance(value, dict)
-            else {prefix + name: value}
-        )
-    return found
-
-
-def nested(flat: dict[str, Any]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for path, value in flat.items():
-        *sections, name = path.split(".")
-        reduce(lambda at, section: at.setdefault(section, {}), sections, tree)[name] = (
-            value
-        )
-    return tree
-
-
 @given(SOME, SOME, st.sets(st.sampled_from(["imu", "dvl", "depth", "sonar"])))
-def test_every_field_comes_from_the_first_that_says_it(
-    of_file: dict[str, Any], of_record: dict[str, Any], in_tree: set[str]
-) -> None:
+def test_every_field_comes_from_the_first_that_says_it(of_file, of_record, in_tree):
     recorded = Calibration.model_validate(nested(of_record))
     tree = {name: Mounting(translation_m=TREE_M, rpy_rad=(0, 0, 1)) for name in in_tree}
-    found = leaves(gathered(said(**nested(of_file)), recorded, tree).model_dump())
-    expected = leaves(Calibration().model_dump())
+    found = flattened(gathered(said(**nested(of_file)), recorded, tree).model_dump())
+    expected = flattened(Calibration().model_dump())
     for name in in_tree - {"depth"}:
         expected |= {
             f"{name}.mounting.translation_m": TREE_M,
@@ -229,7 +171,7 @@ def test_every_field_comes_from_the_first_that_says_it(
     assert found == expected | of_record | of_file
 
 
-def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:
+def test_a_section_is_completed_by_the_log_or_taken_away_by_false():
     floor = gathered(said(floor={"z_m": -2}), FLOOR, {}).floor
     assert floor is not None
     assert (floor.z_m, floor.sigma_m) == (-2, 0.1)
@@ -271,8 +213,8 @@ BROKEN_RECORDS: list[tuple[dict[str, str], type[Exception], str]] = [
 
 
 def test_mistakes_are_found_before_a_log_is_read_and_broken_records_named(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+    make_sequence, tmp_path
+):
     for values, message in MISTAKES:
         with pytest.raises(CalibrationError, match=message):
             said(**values)

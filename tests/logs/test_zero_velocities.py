@@ -4,17 +4,17 @@ The vehicle drives level circles: with speed s and yaw rate r the rate is (0, 0,
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from sonar_graph import Calibration, Dvl, Imu, Sequence
-from sonar_graph.logs import read_log, row_notes, unfelt_zeros, write_log
+from sonar_graph.logs import read_log, row_notes, write_log
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.logs.checks import unfelt_zeros
 from sonar_graph.measurements import Floats
+
+from .conftest import copy, recorded, writing
 
 SECOND = 1_000_000_000
 RATE_RAD_S = 0.1
@@ -57,43 +57,22 @@ def without_lock(run: Sequence, begin_s: float, end_s: float) -> Sequence:
 @pytest.mark.parametrize(
     ("begin_s", "end_s"), [(20.0, 22.0), (20.0, 35.0), (0.0, 9.0), (50.0, 60.0)]
 )
-def test_zeros_without_lock_are_found_at_every_rate_and_place(
-    rate_hz: float, begin_s: float, end_s: float
-) -> None:
+def test_zeros_without_lock_are_found_at_every_rate_and_place(rate_hz, begin_s, end_s):
     run = without_lock(drive(rate_hz, cruise), begin_s, end_s)
     t = run.dvl.stamps_ns / SECOND
     found = unfelt_zeros(run.imu, run.dvl, run.calibration)
     assert (found == ((t >= begin_s) & (t < end_s))).all()
 
 
-def without_record(source: Path, target: Path) -> None:
-    """The messages of a log alone, as a vehicle records them: rows of a log with a calibration were chosen before."""
-    with source.open("rb") as stream, target.open("wb") as out:
-        writer = Writer(out)
-        writer.start()
-        channels = {}
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.id not in channels:
-                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, kind, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.id],
-                message.log_time,
-                message.data,
-                message.publish_time,
-            )
-        writer.finish()
-
-
 def test_a_log_with_zeros_is_read_without_them_unless_they_are_measured(
     tmp_path,
-) -> None:
+):
     path = tmp_path / "dive.mcap"
     run = without_lock(drive(1.0, cruise), 20.0, 35.0)
     write_log(tmp_path / "own.mcap", run)
-    without_record(tmp_path / "own.mcap", path)
+    # as a vehicle records them: rows of a log with a calibration were chosen before
+    with writing(path) as writer:
+        copy(recorded(tmp_path / "own.mcap"), writer)
     read = read_log(path)
     assert len(read.dvl) == 45
     assert "15 with a velocity of 0" in read.notes["log.dropped"]

@@ -2,7 +2,7 @@
 
 # fmt: off
 from sonar_graph.logs.adapters.adapter import (
-    ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES, Adapter, Setup, axes_matrix, did_you_mean, leaf_fields, turn,
+    ANGLES, FORCES, LENGTHS, PRESSURES, RATES, SPEEDS, TIMES, Adapter, Setup, axes_matrix, did_you_mean, leaf_fields,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R_NED, GeodeticFields
 from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED, TRUTH_WORDS, Z_DOWN_TYPES, Shipped
@@ -14,17 +14,16 @@ from sonar_graph.logs.adapters.log_config import (
     LogConfig, as_log_config, changes_text, plain_lines, read_log_config, read_toml, shipped_for, shipped_like, table_text,
 )
 from sonar_graph.logs.adapters.message_table import (
-    LARGEST, LAST_S, Dropped, FieldTable, Mask, MessageTable, field_of,
+    LAST_S, Dropped, FieldTable, Mask, MessageTable, field_of,
 )
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter, samples_of_rows
-from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, body_to_ros
+from sonar_graph.logs.adapters.vehicle_messages import body_to_ros
 
 __all__ = [
-    "ADAPTERS", "ANGLES", "Adapter", "DepthAdapter", "DetectionRowsAdapter", "Dropped", "DvlAdapter", "ENU_R_NED", "FORCES",
-    "FieldTable", "GeodeticFields", "ImuAdapter", "LARGEST", "LAST_S", "LENGTHS", "LandmarkRowsAdapter", "LogConfig",
+    "ADAPTERS", "ANGLES", "Adapter", "DetectionRowsAdapter", "Dropped", "DvlAdapter", "ENU_R_NED", "FORCES",
+    "FieldTable", "GeodeticFields", "LAST_S", "LENGTHS", "LandmarkRowsAdapter", "LogConfig",
     "Mask", "MessageTable", "Origin", "PRESSURES", "RATES", "Refused", "SAMPLE_TYPES", "SHIPPED", "SPEEDS", "Setup",
     "Shipped", "SonarAdapter", "TIMES", "TRUTH_WORDS", "Z_DOWN_TYPES", "as_log_config", "axes_matrix", "body_to_ros",
     "changes_text", "detection_warnings", "did_you_mean", "east_north_up", "field_of", "leaf_fields", "plain_lines",
     "range_and_azimuth", "read_log_config", "read_toml", "samples_of_rows", "shipped_for", "shipped_like", "table_text",
-    "turn",
 ]

@@ -11,11 +11,17 @@ from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    model_validator,
+)
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.logs.adapters.geodesy import Origin
+from sonar_graph.logs.adapters.geodesy import Origin, turned
 from sonar_graph.logs.adapters.message_table import (
     SAME_STAMP,
     FieldTable,
@@ -64,11 +70,6 @@ def axes_matrix(rotation: Rotation) -> Floats:
 def turn(rotation: Rotation, vectors: Floats) -> Floats:
     """Vectors along the axes of this package, shape (n, 3); those that need no rotation keep every bit."""
     return vectors if rotation == "flu" else turned(axes_matrix(rotation), vectors)
-
-
-def turned(R: Floats, vectors: Floats) -> Floats:
-    """Product of a matrix with each vector, shape (n, 3), whose bits do not depend on the other vectors."""
-    return (R @ vectors[:, :, None])[:, :, 0]
 
 
 def turn_covariances(rotation: Rotation, covariances: Floats) -> Floats:
@@ -147,15 +148,43 @@ class Setup(NamedTuple):
     """Latitude and longitude (degrees) and height (m) of the world's origin, for positions on the Earth."""
 
 
-class Adapter(Section):
+class PathSection(Section):
+    """Section with paths of fields, an adapter or a part of one."""
+
+    PATHS: ClassVar[tuple[str, ...]] = ()
+    """Attributes with paths that a message must have."""
+
+    EITHER: ClassVar[tuple[tuple[str, str, str], ...]] = ()
+    """Pairs of attributes of which one must be given, with the words for both."""
+
+    @model_validator(mode="after")
+    def _has_one_of_each(self) -> Self:
+        for one, other, both in self.EITHER:
+            if (getattr(self, one) is None) == (getattr(self, other) is None):
+                raise ValueError(f"give either {both}")
+        return self
+
+    def fields_used(self) -> Iterator[str]:
+        """Paths that a message must have, except for the stamp's; their fields have the same size in all messages."""
+        return field_paths(*(getattr(self, name) for name in self.PATHS))
+
+
+def field_paths(*values: str | Iterable[str] | PathSection | None) -> Iterator[str]:
+    """Paths in attributes of an adapter, each one path, several, or none."""
+    for value in values:
+        if isinstance(value, PathSection):
+            yield from value.fields_used()
+        else:
+            yield from (value,) if isinstance(value, str) else value or ()
+
+
+class Adapter(PathSection):
     """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
 
     A subclass adds the attributes of its role, names those that hold paths in `PATHS`, and gives the measurements, with
     the number of rows left out by reason, in ``read(table, setup)``.
     """
 
-    PATHS: ClassVar[tuple[str, ...]] = ()
-    """Attributes with paths that a message must have."""
     LISTS: ClassVar[tuple[str, ...]] = ()
     """Further paths, whose fields differ in length from message to message."""
     type: str
@@ -189,14 +218,10 @@ class Adapter(Section):
                 values[key] = {**old.model_dump(), **value}
         return self.model_validate(values)
 
-    def fields(self) -> Iterator[str]:
-        """Paths that a message must have, except for the stamp's; their fields have the same size in all messages."""
-        return field_paths(*(getattr(self, name) for name in self.PATHS))
-
     def missing_in(self, definition: Struct) -> list[str]:
         """Paths that a message type must have and does not."""
         known = dict(leaf_fields(definition))
-        paths = (*self.fields(), *self.LISTS)
+        paths = (*self.fields_used(), *self.LISTS)
         return [path for path in paths if field_of(path)[0] not in known]
 
     def refusal(self, topic: Topic) -> str | None:  # noqa: ARG002  # for subclasses
@@ -230,26 +255,6 @@ class Adapter(Section):
     def warnings(self, table: FieldTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
         """Contradictions and unlikely values in messages that can be read."""
         yield from ()
-
-
-class PathSection(Section):
-    """Section of an adapter with paths of its own."""
-
-    PATHS: ClassVar[tuple[str, ...]]
-    """Attributes with paths that a message must have."""
-
-    def paths(self) -> Iterator[str]:
-        """Paths that a message must have."""
-        return field_paths(*(getattr(self, name) for name in self.PATHS))
-
-
-def field_paths(*values: str | Iterable[str] | PathSection | None) -> Iterator[str]:
-    """Paths in attributes of an adapter, each one path, several, or none."""
-    for value in values:
-        if isinstance(value, PathSection):
-            yield from value.paths()
-        else:
-            yield from (value,) if isinstance(value, str) else value or ()
 
 
 def leaf_fields(

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.logs.adapters.adapter import (
@@ -22,10 +22,9 @@ from sonar_graph.logs.adapters.adapter import (
     PathSection,
     Setup,
     axes_matrix,
-    turned,
     variances,
 )
-from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
+from sonar_graph.logs.adapters.geodesy import Origin, east_north_up, turned
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     FieldTable,
@@ -60,6 +59,7 @@ class HeadingAdapter(Adapter):
     """Yaw of the body, from an orientation or from one angle."""
 
     PATHS = ("orientation", "yaw", "variance", "status")
+    EITHER = (("orientation", "yaw", "orientation = [x, y, z, w] or yaw"),)
 
     orientation: tuple[str, str, str, str] | None = None
     """Fields of the quaternion's x, y, z, w: the sensor in the world."""
@@ -77,12 +77,6 @@ class HeadingAdapter(Adapter):
     """Messages that state no variance are no measurements: drivers fill orientations that nothing measured."""
     status: str | None = None
     """Field that is -1 where the orientation was not measured."""
-
-    @model_validator(mode="after")
-    def _has_one_source(self) -> HeadingAdapter:
-        if (self.orientation is None) == (self.yaw is None):
-            raise ValueError("give either orientation = [x, y, z, w] or yaw")
-        return self
 
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None without one."""
@@ -267,6 +261,13 @@ class PlaceAdapter(Adapter):
     """Positions, in latitude and longitude or in metres of the world."""
 
     PATHS: ClassVar[tuple[str, ...]] = ("position", "geodetic")
+    EITHER = (
+        (
+            "geodetic",
+            "position",
+            "position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}",
+        ),
+    )
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth."""
     position: tuple[str, str, str] | None = None
@@ -275,14 +276,6 @@ class PlaceAdapter(Adapter):
     """Turns `position` into metres, and its covariance by the square; 0.001 or "mm" from millimetres."""
     world: World = "enu"
     """"enu" (any world with z up), or "ned"; of `position`."""
-
-    @model_validator(mode="after")
-    def _has_one_place(self) -> PlaceAdapter:
-        if (self.geodetic is None) == (self.position is None):
-            raise ValueError(
-                "give either position = [x, y, z] or geodetic = {latitude = ..., longitude = ...}"
-            )
-        return self
 
     def scaled(self, table: FieldTable) -> Floats:
         """Values of `position` in metres, along the driver's axes, shape (n, 3)."""

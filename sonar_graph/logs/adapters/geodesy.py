@@ -17,6 +17,11 @@ FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 
 
+def turned(R: Floats, vectors: Floats) -> Floats:
+    """Product of a matrix with each vector, shape (n, 3), whose bits do not depend on the other vectors."""
+    return (R @ vectors[:, :, None])[:, :, 0]
+
+
 def earth_centred(
     latitude_rad: Floats, longitude_rad: Floats, height_m: Floats
 ) -> Floats:
@@ -47,5 +52,4 @@ def east_north_up(
         [east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]]
     )
     from_centre = earth_centred(latitude_rad, longitude_rad, height_m) - centre
-    # row by row: a message alone gives the same bits
-    return (enu_R_earth @ from_centre[:, :, None])[:, :, 0]
+    return turned(enu_R_earth, from_centre)

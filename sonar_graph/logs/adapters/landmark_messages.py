@@ -9,7 +9,7 @@ Impossible identities are refused, impossible rows are left out, and unlikely on
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -21,9 +21,9 @@ from sonar_graph.logs.adapters.adapter import (
     Setup,
     turn,
     turn_covariances,
-    turned,
 )
 from sonar_graph.logs.adapters.aiding_messages import ENU_R, World
+from sonar_graph.logs.adapters.geodesy import turned
 from sonar_graph.logs.adapters.message_table import (
     NOT_FINITE,
     FieldTable,
@@ -56,12 +56,11 @@ class _Rows(NamedTuple):
 
     message: Ints
     """Number of the message in its topic."""
-    stamps_ns: Ints
     ids: Ints
     """Shape (n, k)."""
     probabilities: Floats
     """Shape (n, k)."""
-    values: tuple[Floats, ...]
+    values: tuple[Any, ...]
     """Columns that do not depend on the candidates."""
 
 
@@ -78,22 +77,19 @@ def _joined(table: MessageTable, parts: list[_Rows]) -> _Rows:
     message = np.concatenate([part.message for part in parts])
     is_large = (ids >= FIRST_TOO_LARGE_ID).any(axis=1)
     if is_large.any():
-        where = (
-            f"message {message[np.argmax(is_large)]} has an identity of 2^56 or more"
-        )
+        first = message[np.argmax(is_large)]
         raise table.topic.error(
-            f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false"
+            f"message {first} has an identity of 2^56 or more; {ID_ADVICE}, or do not use them: [detections] use = false"
         )
     # rows of one stamp keep the order in which they were sent
     order = np.argsort(message, kind="stable")
-    values = zip(*(part.values for part in parts), strict=True)
-    return _Rows(
-        message[order],
-        np.concatenate([part.stamps_ns for part in parts])[order],
-        ids[order],
-        stacked((part.probabilities for part in parts), 0)[order],
-        tuple(np.concatenate(columns)[order] for columns in values),
-    )
+    probabilities = stacked((part.probabilities for part in parts), 0)
+    columns = zip(*(part.values for part in parts), strict=True)
+    values = tuple(np.concatenate(column)[order] for column in columns)
+    return _Rows(message[order], ids[order], probabilities[order], values)
+
+
+_LISTS = ("range_m", "azimuth_rad", "covariance", "candidate_ids", "id_probability")
 
 
 class DetectionListsAdapter(Adapter):
@@ -123,61 +119,47 @@ class DetectionListsAdapter(Adapter):
             NO_POSTERIOR: no_posterior(rows.probabilities),
         }
         measured = (ranges, azimuths, covariances * np.outer(scales, scales))
-        return _fit(rows, faults, measured, tracks)
+        return _fit(table, rows, faults, measured, tracks)
 
     def _rows(self, table: MessageTable, group: Messages) -> _Rows:
-        frames, count = group["range_m"].shape
-        ids = group["candidate_ids"]
-        sizes = {
-            "azimuths": group["azimuth_rad"].shape[1] - count,
-            "covariance elements": group["covariance"].shape[1] - 4 * count,
-            "identities": ids.shape[1] % count,
-            "probabilities": group["id_probability"].shape[1] - ids.shape[1],
-        }
+        columns = [group[name] for name in _LISTS]
+        count, azimuths, elements, ids, probabilities = (c.shape[1] for c in columns)
         where = f"message {group.rows[0]} has {count} ranges"
-        if any(sizes.values()):
+        if (azimuths, elements, ids % count) != (count, 4 * count, 0) or (
+            ids != probabilities
+        ):
             raise table.topic.error(
-                f"{where}, {group['azimuth_rad'].shape[1]} azimuths, {group['covariance'].shape[1]} covariance elements, "
-                f"{ids.shape[1]} identities, {group['id_probability'].shape[1]} probabilities; expected n, n, 4n, kn and kn"
+                f"{where}, {azimuths} azimuths, {elements} covariance elements, {ids} identities, {probabilities} "
+                "probabilities; expected n, n, 4n, kn and kn"
             )
-        total = frames * count
-        tracks = np.full(total, NO_TRACK, np.int64)
+        message = np.repeat(group.rows, count)
+        tracks = np.full(len(message), NO_TRACK, np.int64)
         # not in old logs
         if "track" in group.layout.columns and group["track"].size:
             if group["track"].shape[1] != count:
                 raise table.topic.error(
                     f"{where} and {group['track'].shape[1]} tracks; expected as many, or none"
                 )
-            tracks = group["track"].astype(np.int64).reshape(total)
-        values = (
-            group["range_m"].reshape(total),
-            group["azimuth_rad"].reshape(total),
-            group["covariance"].reshape(total, 2, 2),
-            tracks,
+            tracks = group["track"].astype(np.int64).reshape(-1)
+        range_m, azimuth_rad, pairs, identities, posterior = (
+            column.reshape(len(message), -1) for column in columns
         )
-        return _Rows(
-            *_places(table, group, count),
-            ids.reshape(total, -1),
-            group["id_probability"].reshape(total, -1),
-            values,
-        )
-
-
-def _places(table: MessageTable, group: Messages, count: int) -> tuple[Ints, Ints]:
-    """Number and stamp of the message of each detection, ``count`` to a message."""
-    stamps_ns = table.stamps_ns[group.rows]
-    return np.repeat(group.rows, count), np.repeat(stamps_ns, count)
+        covariances = pairs.reshape(-1, 2, 2)
+        values = (range_m[:, 0], azimuth_rad[:, 0], covariances, tracks)
+        return _Rows(message, identities, posterior, values)
 
 
 def _fit(
+    table: MessageTable,
     rows: _Rows,
     faults: Mapping[str, np.ndarray],
     measured: tuple[Floats, Floats, Floats],
     tracks: Floats | Ints,
 ) -> Fit[LandmarkDetections]:
     """Rows fit for use, from ranges, azimuths and covariances."""
+    stamps_ns = table.stamps_ns[rows.message]
     columns = (*measured, rows.ids, rows.probabilities, tracks)
-    return fit_block(LandmarkDetections, rows.stamps_ns, faults, *columns, unique=False)
+    return fit_block(LandmarkDetections, stamps_ns, faults, *columns, unique=False)
 
 
 _SCORE = "detections.results.hypothesis.score"
@@ -235,7 +217,8 @@ class DetectionArrayAdapter(Adapter):
             NOT_FINITE: not_finite(ranges, azimuths, scores),
             "at the sonar itself": ranges == 0,
         }
-        return _fit(rows, faults, measured, np.full(len(ranges), NO_TRACK))
+        tracks = np.full(len(ranges), NO_TRACK)
+        return _fit(table, rows, faults, measured, tracks)
 
     def _rows(self, table: MessageTable, group: Messages) -> _Rows:
         """Every detection, with the results of each at its own places; NaN: unknown."""
@@ -265,12 +248,9 @@ class DetectionArrayAdapter(Adapter):
             # zeros and a negative variance are unknown
             known = pose.any(axis=(2, 3)) & (pose[..., 0, 0] >= 0)
             covariances[:, some] = np.where(known[..., None, None], pose, np.nan)
-        return _Rows(
-            *_places(table, group, m),
-            ids.reshape(-1, k),
-            scores.reshape(-1, k),
-            (positions.reshape(-1, 3), covariances.reshape(-1, 3, 3)),
-        )
+        values = (positions.reshape(-1, 3), covariances.reshape(-1, 3, 3))
+        message = np.repeat(group.rows, m)
+        return _Rows(message, ids.reshape(-1, k), scores.reshape(-1, k), values)
 
     def _identity(self, table: MessageTable, name: str) -> int:
         try:
@@ -316,20 +296,19 @@ class LandmarkMapAdapter(Adapter):
         """The last map of a topic."""
         # a map is latched: the newest counts
         last = max(table.groups, key=lambda group: int(group.rows[-1]))
-        ids, position, covariance = (
-            last[name][-1] for name in ("ids", "position", "covariance")
-        )
+        names = ("ids", "position", "covariance")
+        ids, position, covariance = (last[name][-1] for name in names)
         count = len(ids)
-        different = len(np.unique(ids))
-        if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
+        different, order = np.unique(ids, return_index=True)
+        sizes = (len(different), len(position), len(covariance))
+        if sizes != (count, 3 * count, 9 * count):
             raise table.topic.error(
-                f"{count} ids ({different} different), {len(position)} position and {len(covariance)} covariance "
-                f"elements; expected n different, 3n and 9n"
+                f"{count} ids ({sizes[0]} different), {sizes[1]} position and {sizes[2]} covariance elements; "
+                "expected n different, 3n and 9n"
             )
-        order = np.argsort(ids)
         positions = position.reshape(-1, 3)[order]
         covariances = covariance.reshape(-1, 3, 3)[order]
-        return LandmarkMap(ids[order].astype(np.int64), positions, covariances), {}
+        return LandmarkMap(different.astype(np.int64), positions, covariances), {}
 
 
 def detection_warnings(

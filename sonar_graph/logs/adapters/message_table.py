@@ -7,7 +7,6 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import NS_PER_S, Block, Ints
 
@@ -28,16 +27,6 @@ SMALLER = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of stamps that are no seconds."""
 LOG_TIME = "log"
 """Value of `Adapter.stamp` that stands for the time of recording."""
-
-
-def header_stamps_ns(
-    group: Messages, log_times_ns: Ints, prefix: str = "header.stamp."
-) -> Ints:
-    """Stamps of messages from their headers, shape (n,); the topic's times of recording where these are zero."""
-    stamps_ns = (
-        group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
-    )
-    return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
 
 
 class FieldTable(ABC):
@@ -103,9 +92,12 @@ class MessageTable(FieldTable):
             self._require(f"{stamp}.sec")
             self.stamps_ns = np.empty(len(topic), np.int64)
             for group in self.groups:
-                self.stamps_ns[group.rows] = header_stamps_ns(
-                    group, log_times_ns, f"{stamp}."
-                )
+                seconds = group[f"{stamp}.sec"].astype(np.int64)
+                stamps_ns = seconds * NS_PER_S + group[f"{stamp}.nanosec"]
+                of_log_ns = log_times_ns[group.rows]
+                # without a stamp the time of recording counts
+                is_unset = stamps_ns == 0
+                self.stamps_ns[group.rows] = np.where(is_unset, of_log_ns, stamps_ns)
         if stamp_offset_s:
             self.stamps_ns = self.stamps_ns + round(stamp_offset_s * NS_PER_S)
 

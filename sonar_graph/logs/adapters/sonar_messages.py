@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs.adapters.adapter import Adapter
@@ -58,6 +58,10 @@ class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
     PATHS = ("data", "ranges", "range_resolution", "bearings", "directions", *KINDS)
+    EITHER = (
+        ("ranges", "range_resolution", "ranges or range_resolution"),
+        ("bearings", "directions", "bearings or directions"),
+    )
     data: str
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"
@@ -86,14 +90,6 @@ class SonarAdapter(Adapter):
     row_bytes: str | None = None
     """Field with the number of bytes of a row, gain and padding included."""
 
-    @model_validator(mode="after")
-    def _has_one_of_each(self) -> SonarAdapter:
-        if (self.ranges is None) == (self.range_resolution is None):
-            raise ValueError("give either ranges or range_resolution")
-        if (self.bearings is None) == (self.directions is None):
-            raise ValueError("give either bearings or directions")
-        return self
-
     def read(
         self, topic: Topic, refused: Refused | None = None
     ) -> Iterator[SonarFrames]:
@@ -120,14 +116,16 @@ class SonarAdapter(Adapter):
         ]
         if not blocks:
             return
-        rows = np.concatenate([images.rows for images in blocks])
-        counts = [len(images.rows) for images in blocks]
-        block = np.repeat(np.arange(len(blocks)), counts)
-        within = np.concatenate([np.arange(count) for count in counts])
-        order = np.argsort(rows)
-        is_other = np.diff(block[order]) != 0
-        is_earlier = np.diff(table.stamps_ns[rows[order]]) < 0
-        for run in np.split(order, np.flatnonzero(is_other | is_earlier) + 1):
+        # of each message its number in the topic, its block and its place there
+        columns = [
+            np.column_stack([b.rows, np.full(len(b.rows), k), np.arange(len(b.rows))])
+            for k, b in enumerate(blocks)
+        ]
+        places = np.concatenate(columns)
+        rows, block, within = places[np.argsort(places[:, 0])].T
+        is_end = (np.diff(block) != 0) | (np.diff(table.stamps_ns[rows]) < 0)
+        ends = np.flatnonzero(is_end) + 1
+        for run in np.split(np.arange(len(rows)), ends):
             images = blocks[block[run[0]]]
             is_whole = len(run) == len(images.rows)  # then without a copy
             samples = images.samples if is_whole else images.samples[within[run]]
@@ -139,9 +137,10 @@ class SonarAdapter(Adapter):
     ) -> Iterator[_Images]:
         """Images of messages of one layout, apart where beams, bins or samples differ."""
         count = len(group)
+        paths = [getattr(self, name) for name in KINDS]
         flags = [
-            np.full(count, -1) if path is None else group[path].astype(np.int64)
-            for path in (getattr(self, name) for name in KINDS)
+            group[path].astype(np.int64) if path else np.full(count, -1)
+            for path in paths
         ]
         kinds = np.column_stack(flags)
         bins = group[str(self.ranges or self.range_resolution)]

@@ -182,6 +182,7 @@ class DepthAdapter(Adapter):
     """Height of the pressure port, from a pressure or from a field in metres."""
 
     PATHS = ("pressure", "height", "variance")
+    EITHER = (("pressure", "height", "pressure or height"),)
 
     pressure: str | None = None
     """Field with a pressure."""
@@ -195,12 +196,6 @@ class DepthAdapter(Adapter):
     """1000 for fresh water, 1025 for the sea."""
     variance: CovarianceFields | None = None
     """One field, before `scale`; without it, or where it is not above 0, the calibration's noise holds."""
-
-    @model_validator(mode="after")
-    def _has_one_source(self) -> DepthAdapter:
-        if (self.pressure is None) == (self.height is None):
-            raise ValueError("give either pressure or height")
-        return self
 
     def read(self, table: FieldTable, setup: Setup) -> Fit[Depth]:
         """Heights with variances; NaN: unknown."""

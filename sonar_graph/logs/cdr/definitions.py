@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.resources import files
 
 from sonar_graph.errors import LogError
@@ -44,6 +44,7 @@ DEFINITIONS = {
 """Fields of each type that this package writes or knows, by its name."""
 
 
+@cache
 def definition(type_name: str) -> str:
     """Interface text of a type such as ``sensor_msgs/msg/Imu``, with all types that it uses, as in an MCAP schema."""
     wanted = [short_name(type_name)]
@@ -98,13 +99,13 @@ class Field:
     """True for an array or sequence."""
 
 
-def parse_definition(type_name: str, text: str) -> Struct:
+def parse_definition(type_name: str, text: str | None = None) -> Struct:
     """Tree of a message type, such as ``sensor_msgs/msg/Imu``, from its ``ros2msg`` text with all dependencies.
 
-    Relative type names in the text belong to the package of the type. A LogError names the line that is not a field, or
-    the type whose definition is not in the text.
+    Without a text the type is one of `DEFINITIONS`. Relative type names in the text belong to the package of the type.
+    A LogError names the line that is not a field, or the type whose definition is not in the text.
     """
-    found = _parsed(type_name, text)
+    found = _parsed(type_name, definition(type_name) if text is None else text)
     if isinstance(found, str):
         raise LogError(found)
     return found

@@ -2,8 +2,8 @@
 
 The place of a field depends only on the type and on the lengths of the strings and sequences before it. A `Plan` is the
 type as steps: neighbouring values of fixed number are one step, whatever types they are nested in; each string, each
-sequence, and each array of strings or types is another. A `PayloadWalk` takes the steps once, with lengths read from a
-payload or given, and notes where each begins. The `Layout` that results holds for all payloads with the same lengths.
+sequence, and each array of strings or types is another. A `Layout` takes the steps once, with lengths read from a
+payload or given, and notes where each begins. It holds for all payloads with the same lengths.
 
 Encoding is plain CDR (XCDR1, OMG DDS-XTypes 1.3, 7.4.1): a four-byte encapsulation header, then primitives aligned to
 their own size counted from after that header; a string is its length with the closing NUL as uint32 and its bytes; a
@@ -16,7 +16,9 @@ Other messages are left out and counted by their fault.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache
 from struct import Struct as Packing
@@ -38,29 +40,8 @@ def padding(at: int, size: int) -> int:
     return -(at - HEADER_BYTES) % size
 
 
-class PayloadWalk:
-    """Places of the parts of a payload, noted while the steps of a plan are taken."""
-
-    def __init__(
-        self,
-        steps: int,
-        length_of: Callable[[DecodingStep, int], int],
-        most_elements: int | None,
-    ) -> None:
-        self.found: list[list[int]] = [[] for _ in range(steps)]
-        """By step: the start of each block; for other steps start and count in turn."""
-        self.words: list[tuple[int, int]] = []
-        """Byte offset and value of each length word."""
-        self.end = HEADER_BYTES
-        self.most_elements = most_elements
-        self._length_of = length_of
-
-    def length(self, step: DecodingStep, at: int) -> tuple[int, int]:
-        """Byte after a step's length word, and the value of the word."""
-        at += -at % LENGTH_BYTES  # as much as after the header, which is as long
-        count = self._length_of(step, at)
-        self.words.append((at, count))
-        return at + LENGTH_BYTES, count
+LengthOf = Callable[["DecodingStep", int], int]
+"""Value of the length word of a step at a byte offset."""
 
 
 class DecodingStep(ABC):
@@ -68,12 +49,11 @@ class DecodingStep(ABC):
 
     is_text = False
 
-    def __init__(self, index: int, path: str) -> None:
-        self.index = index
+    def __init__(self, path: str) -> None:
         self.path = path
 
     @abstractmethod
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the place of the part at byte ``at``; returns the byte after it."""
 
 
@@ -91,8 +71,8 @@ class Value(NamedTuple):
 class FieldBlock(DecodingStep):
     """Neighbouring values of fixed number."""
 
-    def __init__(self, index: int, values: list[Value]) -> None:
-        super().__init__(index, values[0].path)
+    def __init__(self, values: list[Value]) -> None:
+        super().__init__(values[0].path)
         self.offsets = {value.path: [0] * _PHASES for value in values}
         """Offsets from the start of the block, by that start modulo 8."""
         self.counts = {value.path: value.number for value in values}
@@ -107,51 +87,53 @@ class FieldBlock(DecodingStep):
                 at += size * value.number
             self._sizes[phase] = at - start
 
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:  # noqa: ARG002  # of all steps
         """Note the start of the block, before any padding."""
-        walk.found[self.index].append(at)
+        layout.found[self].append(at)
         return at + self._sizes[at % _PHASES]
 
 
 class Counted(DecodingStep):
     """Values whose count is in the payload: a string, or a sequence of numbers."""
 
-    def __init__(self, index: int, path: str, kind: str, *, is_text: bool) -> None:
-        super().__init__(index, path)
+    def __init__(self, path: str, kind: str, *, is_text: bool) -> None:
+        super().__init__(path)
         self.is_text = is_text
         self._size = np.dtype(kind).itemsize
 
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the place of the first value and their count; the NUL that closes a string is one."""
-        at, count = walk.length(self, at)
-        # numbers are aligned where there is one
-        if count:
+        at, count = layout.counted(self, at, length_of)
+        # numbers are aligned where there is one, and texts need no step for it
+        if count and self._size > 1:
             at += padding(at, self._size)
-        walk.found[self.index] += (at, count)
+        layout.found[self] += (at, count)
         return at + count * self._size
 
 
 class Repeated(DecodingStep):
     """Array or sequence of strings or of another type."""
 
-    def __init__(
-        self, index: int, path: str, count: int | None, steps: list[DecodingStep]
-    ) -> None:
-        super().__init__(index, path)
+    def __init__(self, path: str, count: int | None, steps: list[DecodingStep]) -> None:
+        super().__init__(path)
         self._count = count
         self._steps = steps
 
-    def take(self, at: int, walk: PayloadWalk) -> int:
+    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
         """Note the start and count of the elements, and walk through them."""
         # a fixed array has no length word
-        at, count = walk.length(self, at) if self._count is None else (at, self._count)
-        walk.found[self.index] += (at, count)
-        if walk.most_elements is not None and count > walk.most_elements:
+        at, count = (
+            layout.counted(self, at, length_of)
+            if self._count is None
+            else (at, self._count)
+        )
+        layout.found[self] += (at, count)
+        if count > layout.most_elements:
             # every element has a byte at least, so this is beyond the end
             return at + count
         for _ in range(count):
             for step in self._steps:
-                at = step.take(at, walk)
+                at = step.take(at, layout, length_of)
         return at
 
 
@@ -174,24 +156,9 @@ class Plan:
         """Leaves by path, such as ``header.stamp.sec``; all elements of a sequence share one path."""
         self.sequences: dict[str, DecodingStep] = {}
         """Arrays and sequences by path, without arrays of numbers."""
-        self._parts = 0
-        self._steps = self._compile(definition, "", is_single=True)
+        self.steps = self._compile(definition, "", is_single=True)
         self.texts = [path for path, leaf in self.leaves.items() if leaf.step.is_text]
         self.booleans = [path for path, leaf in self.leaves.items() if leaf.kind == "?"]
-
-    def walk(
-        self,
-        length_of: Callable[[DecodingStep, int], int],
-        most_elements: int | None = None,
-    ) -> PayloadWalk:
-        """Take all steps; ``length_of`` gives the length word of a step at a byte offset.
-
-        An array of more than ``most_elements`` would reach beyond the end of the payload.
-        """
-        walk = PayloadWalk(self._parts, length_of, most_elements)
-        for step in self._steps:
-            walk.end = step.take(walk.end, walk)
-        return walk
 
     def _compile(
         self, definition: Struct, prefix: str, *, is_single: bool
@@ -234,30 +201,26 @@ class Plan:
         else:
             is_text = entry.kind == STRING
             kind = PRIMITIVES.get(entry.kind, "u1")
-            counted = Counted(self._next(), path, kind, is_text=is_text)
+            counted = Counted(path, kind, is_text=is_text)
             self.leaves[path] = Leaf(counted, kind, is_single)
             # strings in an array or sequence have a length word each
             if not is_text or not entry.is_array:
                 return counted
             inner = [counted]
-        repeated = Repeated(self._next(), path, entry.length, inner)
+        repeated = Repeated(path, entry.length, inner)
         self.sequences[path] = repeated
         return repeated
 
     def _close(self, steps: list[DecodingStep], values: list[Value]) -> None:
         """Make a block of the values gathered so far."""
         if values:
-            block = FieldBlock(self._next(), values)
+            block = FieldBlock(values)
             steps.append(block)
             for path, kind, _, is_single in values:
                 # a type without fields has a byte that is no field
                 if path and not path.endswith("."):
                     self.leaves[path] = Leaf(block, kind, is_single)
             values.clear()
-
-    def _next(self) -> int:
-        self._parts += 1
-        return self._parts - 1
 
 
 @lru_cache(maxsize=256)
@@ -287,15 +250,36 @@ class PayloadColumn(NamedTuple):
 class Layout:
     """Places of all fields in payloads with the same lengths of strings and sequences."""
 
-    def __init__(self, plan: Plan, byte_order: str, walk: PayloadWalk) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        byte_order: str,
+        length_of: LengthOf,
+        most_elements: float = math.inf,
+    ) -> None:
         self.columns = plan.leaves
         """Fields that hold values by path, such as ``header.stamp.sec``."""
         self.byte_order = byte_order
-        self.size = walk.end
-        self.words = walk.words
         self.plan = plan
-        self._found = walk.found
+        self.found: dict[DecodingStep, list[int]] = defaultdict(list)
+        """By step: the start of each block; for other steps start and count in turn."""
+        self.words: list[tuple[int, int]] = []
+        """Byte offset and value of each length word."""
+        self.most_elements = most_elements
+        """An array of more would reach beyond the end of the payload."""
         self._places: dict[str, PayloadColumn] = {}
+        self.size = HEADER_BYTES
+        for step in plan.steps:
+            self.size = step.take(self.size, self, length_of)
+
+    def counted(
+        self, step: DecodingStep, at: int, length_of: LengthOf
+    ) -> tuple[int, int]:
+        """Byte after a step's length word, and the value of the word."""
+        at += -at % LENGTH_BYTES  # as much as after the header, which is as long
+        count = length_of(step, at)
+        self.words.append((at, count))
+        return at + LENGTH_BYTES, count
 
     def column(self, path: str) -> PayloadColumn:
         """Places of the values of a field; a KeyError where the type has no such field with values of its own."""
@@ -307,7 +291,7 @@ class Layout:
     def _place(self, path: str) -> PayloadColumn:
         step, kind, is_single = self.columns[path]
         dtype = np.dtype(self.byte_order + kind)
-        found = self._found[step.index]
+        found = self.found[step]
         if not isinstance(step, FieldBlock):
             return PayloadColumn(dtype, is_single, found[::2], found[1::2])
         offsets = step.offsets[path]
@@ -319,7 +303,7 @@ class Layout:
         """Number of elements of an array or sequence, one each time it occurs."""
         if path not in self.plan.sequences:
             return self.column(path).counts
-        return self._found[self.plan.sequences[path].index][1::2]
+        return self.found[self.plan.sequences[path]][1::2]
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
@@ -373,13 +357,13 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
             raise UnsoundMessageError(f"with a length of {step.path} beyond their end")
         return length
 
-    walk = plan.walk(read_length, most_elements=size)
-    if walk.end > size:
+    layout = Layout(plan, order, read_length, size)
+    if layout.size > size:
         raise UnsoundMessageError("that end before their definition does")
     # a definition that is too short would read as sound
-    if walk.end < size - MOST_PADDING:
+    if layout.size < size - MOST_PADDING:
         raise UnsoundMessageError("that are longer than their definition says")
-    return Layout(plan, order, walk)
+    return layout
 
 
 def unsound_contents(

@@ -213,8 +213,7 @@ def encode(
     if unknown:
         raise ValueError(f"{definition.name} has no field {', '.join(sorted(unknown))}")
     order = "<"
-    length_of = _given_lengths(values, lengths or {})
-    layout = Layout(plan, order, plan.walk(length_of))
+    layout = Layout(plan, order, _given_lengths(values, lengths or {}))
     payloads = np.zeros((n, layout.size), np.uint8)
     payloads[:, :2] = np.frombuffer(ENCAPSULATIONS[order], np.uint8)
     for at, length in layout.words:

@@ -289,7 +289,7 @@ def _unused_validity(dvl: CsvRole, table: CsvTable) -> Iterator[str]:
     if not isinstance(dvl.adapter, DvlAdapter) or dvl.adapter.velocity is None:
         return
     velocity = table.beside(dvl.adapter.velocity)
-    used = set(dvl.adapter.fields())
+    used = set(dvl.adapter.fields_used())
     unused = [name for name in table.file.names if name not in used]
     for name, mark, marks in marked_valid(table.file, unused, velocity):
         invalid = int(np.count_nonzero(marks != mark))
@@ -323,7 +323,7 @@ def _table(one: CsvRole, files: Mapping[str, Path], source: str) -> CsvTable:
     return CsvTable(
         CsvFile(files[wanted], one.form),
         one.role,
-        adapter.fields(),
+        adapter.fields_used(),
         adapter.stamp if has_times else None,
         adapter.stamp_unit_s,
         adapter.stamp_offset_s,

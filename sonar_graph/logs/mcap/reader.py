@@ -6,6 +6,7 @@ unchecked, only when a summary under a CRC states that it holds no wanted topic,
 """
 
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -99,11 +100,7 @@ class Passage:
         self._file = file
         self._may_skip = may_skip
         self._progress = progress
-        self._described = Descriptions(file.path, keep)
-        self.topics = self._described.by_name
-        """All described topics by name."""
-        self.as_written = self._described.as_written
-        """Channel and schema of each topic."""
+        self.described = Descriptions(file.path, keep)
         self._walk = RecordWalk(file)
         self._data_end: Record | None = None
         self._last_ns: int | None = None
@@ -113,7 +110,7 @@ class Passage:
         self._is_loose = False
         # those of the summary come first: they replace any that are lost in the data
         for described in file.described:
-            self._described.add(described)
+            self.described.add(described)
 
     @property
     def counts(self) -> dict[str, int] | None:
@@ -121,10 +118,9 @@ class Passage:
         summary = self._file.summary
         if summary is None or summary.statistics is None:
             return None
-        found: dict[str, int] = {}
+        found = Counter[str]()
         for channel, count in summary.statistics.channel_message_counts.items():
-            name = self._name(channel)
-            found[name] = found.get(name, 0) + count
+            found[self._name(channel)] += count
         return found or None
 
     def __iter__(self) -> Iterator[ChunkPart]:
@@ -145,7 +141,7 @@ class Passage:
         first_ns, after_ns, _ = self.limits or (start_ns, end_ns + 1, "")
         is_inside = start_ns < after_ns and end_ns >= first_ns
         topics = [
-            self._described.by_channel.get(channel)
+            self.described.by_channel.get(channel)
             for channel in index.message_index_offsets
         ]
         # without message indexes the summary does not state which topics a chunk holds
@@ -233,7 +229,7 @@ class Passage:
         for opcode, described in content.described:
             kind = Schema if opcode == Opcode.SCHEMA else Channel
             try:
-                self._described.add(parse(kind.read, described))
+                self.described.add(parse(kind.read, described))
             except LogError as error:
                 self._lose(record, f"the description of a channel is lost: {error}", {})
         if content.span_ns is not None:
@@ -245,7 +241,7 @@ class Passage:
             self._last_ns = max(self._last_ns or 0, last_ns)
         for channel, found in content.channels.items():
             # a payload without a definition cannot be decoded
-            topic = self._described.by_channel.get(channel)
+            topic = self.described.by_channel.get(channel)
             if topic is None:
                 self._lose(
                     record,
@@ -261,7 +257,7 @@ class Passage:
                 yield ChunkPart(topic, content.data, found)
 
     def _name(self, channel: int) -> str:
-        topic = self._described.by_channel.get(channel)
+        topic = self.described.by_channel.get(channel)
         return f"channel {channel}" if topic is None else topic.name
 
     def _lose(
@@ -275,7 +271,7 @@ class Passage:
         """Complete the account of the damage at the end of the file."""
         damage = self.damage
         size = self._file.size
-        damage.remarks += self._described.remarks
+        damage.remarks += self.described.remarks
         # without the record that ends the data, records after the last one may be missing
         if self._data_end is None and damage.ending is None:
             reason = f"the file is cut off: it ends after a whole record, at byte {size}, without a summary"

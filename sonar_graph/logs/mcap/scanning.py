@@ -9,14 +9,15 @@ from sonar_graph.logs.mcap.bag_folder import log_parts
 from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile
 from sonar_graph.logs.mcap.reader import Passage, Progress, Recording, first_time_ns
 from sonar_graph.logs.mcap.time_window import TimeWindow, WindowLimits
-from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
+from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, keeping, settle
 
 _PIECE_BYTES = 1 << 20
+_NUMBERS_ALONE = keeping([])
 
 
 def scan(
     path: Path,
-    keep: Callable[[str], Keep],
+    keep: Callable[[str], Keep] = _NUMBERS_ALONE,
     window: TimeWindow | None = None,
     progress: Progress | None = None,
 ) -> Recording:
@@ -27,7 +28,7 @@ def scan(
     path
         The file or folder.
     keep
-        Part of the messages to keep, by the name of their type.
+        Part of the messages to keep, by the name of their type; without it only their number.
     window
         Wanted time of recording; latched topics such as ``/tf_static`` are read whenever recorded.
     progress
@@ -102,8 +103,8 @@ def _join(whole: Recording, file: LogFile, passage: Passage) -> None:
     counts = passage.counts
     # where chunks are skipped or left out, not every message that can be read was counted
     is_complete = not passage.skipped and passage.limits is None
-    settle(passage.damage, passage.topics, counts if is_complete else None)
-    for name, topic in passage.topics.items():
+    settle(passage.damage, passage.described.by_name, counts if is_complete else None)
+    for name, topic in passage.described.by_name.items():
         # topics that are only counted are listed, although their chunks were skipped
         is_in_skipped = topic.keep is Keep.NONE and bool((counts or {}).get(name))
         if not len(topic) and not is_in_skipped:
@@ -143,7 +144,6 @@ def stream(
     path: Path,
     keep: Callable[[str], Keep],
     window: TimeWindow | None = None,
-    progress: Progress | None = None,
     *,
     salvage: bool = False,
 ) -> Iterator[Topic]:
@@ -153,7 +153,7 @@ def stream(
     `scan`; without ``salvage`` also a file with holes is a LogError, at the end: what was given before is whole.
     """
     damage = Damage()
-    for _, passage in _passages(path, keep, window, progress, damage):
+    for _, passage in _passages(path, keep, window, None, damage):
         held: dict[str, Topic] = {}
         for piece in passage:
             if piece.topic.name not in held:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -19,7 +19,14 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.cdr import Bytes, Decoder, Messages, Struct, parse_definition
+from sonar_graph.logs.cdr import (
+    Bytes,
+    Decoder,
+    Messages,
+    Struct,
+    parse_definition,
+    short_name,
+)
 from sonar_graph.logs.mcap.chunks import unpack_messages
 from sonar_graph.measurements import Ints
 
@@ -35,6 +42,12 @@ class Keep(Enum):
     STAMP = STAMP_BYTES
     """The beginning of each payload, up to the stamp in its header."""
     ALL = -1
+
+
+def keeping(types: Iterable[str], others: Keep = Keep.NONE) -> Callable[[str], Keep]:
+    """Choice of the whole messages of some types, and of a part of those of others, by the name of the type."""
+    wanted = set(map(short_name, types))
+    return lambda kind: Keep.ALL if short_name(kind) in wanted else others
 
 
 @dataclass
@@ -69,6 +82,10 @@ class Topic:
 
     def __len__(self) -> int:
         return self._count
+
+    def is_a(self, type_name: str) -> bool:
+        """True for a topic of a type, with or without the ``msg``."""
+        return short_name(self.type_name) == short_name(type_name)
 
     @property
     def is_ros2(self) -> bool:

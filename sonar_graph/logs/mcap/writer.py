@@ -56,16 +56,6 @@ class Outgoing:
     """True for viewers that join late; the first entry of a topic decides."""
 
 
-@dataclass(frozen=True)
-class Attachment:
-    """A file within the recording."""
-
-    name: str
-    media_type: str
-    """Such as ``application/json``."""
-    content: bytes
-
-
 class SchemaText(NamedTuple):
     """Definition of a message type, as a log holds it."""
 
@@ -100,7 +90,6 @@ def write_recording(
     path: Path,
     messages: list[Outgoing],
     metadata: Mapping[str, Mapping[str, str]],
-    attachments: Sequence[Attachment] = (),
 ) -> None:
     """Write an MCAP file of profile ``ros2``; an existing file is replaced only when the new one is complete.
 
@@ -108,14 +97,6 @@ def write_recording(
     be written is a LogError.
     """
     with recording(path, metadata) as out:
-        end_ns = max(
-            (int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)),
-            default=0,
-        )
-        for file in attachments:
-            out.mcap.add_attachment(
-                0, max(end_ns, 0), file.name, file.media_type, file.content
-            )
         out.write(messages)
 
 

@@ -120,20 +120,6 @@ def dvl(rows: int = 5, **fields: Any) -> Entry:
     return rows_of("/dvl", "marine_acoustic_msgs/msg/Dvl", [message] * rows)
 
 
-def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> Entry:
-    """One frame below the body; what is not given of its quaternion is zero."""
-    transform = {
-        "translation": vector(*xyz),
-        "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0} | rotation,
-    }
-    entry = {
-        "header": at(0, "base_link"),
-        "child_frame_id": link,
-        "transform": transform,
-    }
-    return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [entry]}]
-
-
 def about_values(warnings: str) -> str:
     """Warnings without those about frames: those of most of these messages hang on no tree (`test_vehicle_setup`)."""
     return re.sub(
@@ -178,12 +164,13 @@ class Foreign(Bench):
         toml: str,
         expected: dict[str, Any],
         notes: dict[str, str | None],
+        atol: float = 1e-12,
     ) -> Any:
         """Read entries, and compare values, to single precision, and notes."""
         sequence = self.read(*entries, toml=toml)
         for path, values in expected.items():
             np.testing.assert_allclose(
-                attrgetter(path)(sequence), values, rtol=2e-7, atol=1e-12, err_msg=path
+                attrgetter(path)(sequence), values, rtol=2e-7, atol=atol, err_msg=path
             )
         for name, part in notes.items():
             said = about_values(sequence.notes.get(name, ""))

@@ -1,15 +1,13 @@
 """Log configurations: tables that change adapters, mistakes in them, and tables written from adapters."""
 
 import tomllib
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import SHIPPED, read_log_config
+from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.logs.adapters.log_config import toml_value
 
 DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
@@ -36,9 +34,7 @@ NO_TOPIC: dict[str, str] = {
 
 
 @pytest.mark.parametrize(("toml", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_named_with_its_file_table_and_key(
-    tmp_path: Path, toml: str | None, message: str
-) -> None:
+def test_a_mistake_is_named_with_its_file_table_and_key(tmp_path, toml, message):
     path = tmp_path / "my log.toml"
     if toml is not None:
         path.write_text(toml)
@@ -48,16 +44,9 @@ def test_a_mistake_is_named_with_its_file_table_and_key(
 
 
 @pytest.mark.parametrize(("toml", "message"), NO_TOPIC.items())
-def test_a_topic_that_cannot_be_is_refused(
-    foreign: Any, toml: str, message: str
-) -> None:
+def test_a_topic_that_cannot_be_is_refused(foreign, toml, message):
     with pytest.raises(MissingTopicError, match=message):
         foreign.read(toml=toml)
-
-
-SHIPPED_ADAPTERS = [
-    (role, offer.adapter) for role, offers in SHIPPED.items() for offer in offers
-]
 
 
 LEAVES = (
@@ -73,5 +62,5 @@ LEAVES = (
         st.text(min_size=1), LEAVES | st.lists(LEAVES, max_size=3), max_size=4
     )
 )
-def test_values_are_toml(values: dict[str, Any]) -> None:
+def test_values_are_toml(values):
     assert tomllib.loads(f"x = {toml_value(values)}")["x"] == values

@@ -70,8 +70,8 @@ REFUSALS: dict[str, Refusal] = {
 
 @pytest.mark.parametrize(("entries", "toml", "named"), REFUSALS.values(), ids=REFUSALS)
 def test_a_refusal_names_its_cause_and_what_accepts_the_input(
-    foreign: Any, entries: list[Any], toml: str, named: str
-) -> None:
+    foreign, entries, toml, named
+):
     with pytest.raises(LogError, match=named) as refusal:
         foreign.read(*entries, toml=toml)
     without_folder = str(refusal.value).replace(f"{foreign.folder}/", "")

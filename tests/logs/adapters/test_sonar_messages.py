@@ -1,6 +1,5 @@
 """Sonar images of any driver as frames: order, samples, gains, bearings and ranges."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,12 +8,11 @@ import pytest
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import inspect_log, read_sonar_frames
-from sonar_graph.logs.adapters import SHIPPED, read_log_config
-from sonar_graph.logs.cdr import definition, encode, parse_definition
-from sonar_graph.logs.mcap import Keep, Topic
+from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.measurements import Floats
+from tests.logs.conftest import copy, recorded, writing
 
-from .conftest import Entry, dvl, imu, rows_of, vector
+from .conftest import Entry, at, dvl, imu, rows_of, vector
 
 AZIMUTHS = np.radians([30.0, 0.0, -30.0])
 """Left, middle, right."""
@@ -98,31 +96,28 @@ CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     ("entry", "toml", "intensity", "azimuths_rad"), CASES.values(), ids=CASES
 )
 def test_images_are_beams_by_bins_however_they_come(
-    foreign: Any, entry: Entry, toml: str, intensity: Floats, azimuths_rad: Floats
-) -> None:
+    foreign, entry, toml, intensity, azimuths_rad
+):
     (frames,) = frames_in(foreign, entry, toml=toml)
     np.testing.assert_allclose(frames.intensity, [intensity])
     np.testing.assert_allclose(frames.azimuths_rad, azimuths_rad)
 
 
 @pytest.mark.parametrize(
-    ("entries", "message"),
+    ("entry", "message"),
     [
-        ([images(image(b"\0" * 11))], "/sonar: field .*11 bytes"),
-        ([images(image(b"\0" * 12, 17))], "/sonar: field .*dtype .* is 17"),
+        (images(image(b"\0" * 11)), "/sonar: field .*11 bytes"),
+        (images(image(b"\0" * 12, 17)), "/sonar: field .*dtype .* is 17"),
     ],
 )
-def test_an_image_that_does_not_fit_and_a_choice_that_is_open_are_named(
-    foreign: Any, entries: list[Entry], message: str
-) -> None:
+def test_an_image_that_does_not_fit_is_named(foreign, entry, message):
     with pytest.raises(LogError, match=message):
-        frames_in(foreign, *entries)
-    assert len(entries) == 1 or len(frames_in(foreign, *entries, topic="/right")) == 1
+        frames_in(foreign, entry)
 
 
 def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(
-    foreign: Any,
-) -> None:
+    foreign,
+):
     sound = inspect_log(foreign.write(pings(ping()))).sonar
     assert (
         sound == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
@@ -135,9 +130,7 @@ def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(
 
 
 @pytest.mark.recording
-def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
-    foreign: Any, recordings: Path
-) -> None:
+def test_a_real_oculus_ping_comes_out_as_its_own_header_says(foreign, recordings):
     raw = (recordings / "sonar" / "one_ping_8bit.raw").read_bytes()
     bearings = np.round(np.linspace(-3000, 3000, 256)).astype(int).tolist()
     sizes = {
@@ -162,37 +155,23 @@ def test_a_real_oculus_ping_comes_out_as_its_own_header_says(
     assert right < 0.8 * other
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        [],
-        [1],
-        [0, 1],
-    ],
-)
-def test_messages_that_are_no_image_are_refused_by_their_time(
-    bad: list[int],
-) -> None:
+@pytest.mark.parametrize("bad", [[], [1], [0, 1]])
+def test_messages_that_are_no_image_are_refused_by_their_time(foreign, tmp_path, bad):
     """Several messages may share an instant, sound ones and others."""
-    kind = "marine_acoustic_msgs/msg/ProjectedSonarImage"
-    times_ns = np.array([10, 10, 20, 30, 30, 30])
-    values = {"ranges": np.array([RANGES]), "image.dtype": 0, "image.beam_count": 3}
-    values |= {
-        f"beam_directions.{axis}": np.array([numbers])
-        for axis, numbers in zip("xyz", np.eye(3), strict=True)
-    }
-    values |= {"image.data": np.frombuffer(ROWS, np.uint8)[None], "header.stamp.sec": 1}
-    payload = encode(
-        parse_definition(kind, definition(kind)), 1, values, {"beam_directions": 3}
-    )[0].tobytes()
-    payloads = [payload[:-8] if row in bad else payload for row in range(len(times_ns))]
-    sizes = np.array([len(one) for one in payloads])
-    topic = Topic(
-        Path("a.mcap"), "/sonar", kind, "cdr", "ros2msg", definition(kind), Keep.ALL
-    )
-    topic.gather(b"".join(payloads), np.cumsum(sizes) - sizes, sizes, times_ns)
-    (adapter,) = (one.adapter for one in SHIPPED["sonar"] if one.adapter.type == kind)
-    refused: list[int] = []
-    blocks = list(adapter.read(topic, lambda stamp_ns, _: refused.append(stamp_ns)))
-    assert sorted(refused) == times_ns[bad].tolist()
-    assert sum(len(block) for block in blocks) == len(times_ns) - len(bad)
+    messages = recorded(foreign.write(images(*[image(ROWS)] * 6)))
+    times_ns = [10, 10, 20, 30, 30, 30]
+    for (_, _, message), time_ns in zip(messages, times_ns, strict=True):
+        message.log_time = time_ns
+    path = tmp_path / "bad.mcap"
+    with writing(path) as writer:
+        copy(messages, writer, lambda _, row, data: data[:-8] if row in bad else data)
+    refused = []
+    blocks = read_sonar_frames(path, refused=lambda at_ns, _: refused.append(at_ns))
+    assert sum(map(len, blocks)) == 6 - len(bad)
+    assert refused == [times_ns[row] for row in bad]
+
+
+def test_a_block_of_frames_ends_before_an_earlier_stamp(foreign):
+    earlier = image(ROWS) | {"header": at(-1)}
+    blocks = frames_in(foreign, images(image(ROWS), image(ROWS), earlier))
+    assert [len(block) for block in blocks] == [2, 1]

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import body_to_ros, range_and_azimuth
+from tests.logs.conftest import quaternion, tree
 
-from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, tree, vector
+from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, vector
 
 FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
@@ -36,11 +37,7 @@ def poses(
     topic: str = "/ground_truth/pose",
     kind: str = "",
 ) -> Entry:
-    x, y, z, w = rotation.as_quat().tolist()
-    pose = {
-        "position": vector(1, 2, 3),
-        "orientation": {"x": x, "y": y, "z": z, "w": w},
-    }
+    pose = {"position": vector(1, 2, 3), "orientation": quaternion(rotation)}
     if covariance is None:
         return rows_of(topic, POSE, [{"pose": pose}] * 3)
     row = {"pose": {"pose": pose, "covariance": list(covariance)}}
@@ -56,6 +53,9 @@ NO_FORCE = (
     "accelerometer measures: taken as not measured"
 )
 DIGITS = "9" * 30
+UNMEASURED = [-1.0] + [0.0] * 8
+UNMEASURED_RATE = {"angular_velocity_covariance": UNMEASURED}
+UNMEASURED_FORCE = {"linear_acceleration_covariance": UNMEASURED}
 
 
 def detection(
@@ -116,6 +116,15 @@ CASES: dict[str, Case] = {
     "force of zero once": (
         [imu(rows=2, at_1={"linear_acceleration": vector(0, 0, 0)}), dvl()], "",
         {"imu.specific_force": [[0, 0, 9.8], [0, 0, 0]]}, {}),
+    "a row without a rate, and one without a force": (
+        [imu(at_1=UNMEASURED_RATE, at_2=UNMEASURED_FORCE), dvl()], "",
+        {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 2, 3, 4]),
+         "imu.specific_force": [[0, 0, 9.8], [NAN] * 3, *[[0, 0, 9.8]] * 2]},
+        {"log.dropped": "imu: 1 without angular rate"}),
+    "a rate that is no number": (
+        [imu(at_2={"angular_velocity": vector(NAN, 0, 0)}), dvl()], "",
+        {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 1, 3, 4])},
+        {"log.dropped": "imu: 1 with values that are not finite"}),
     "wild rate": (
         [imu(300, at_150={"angular_velocity": vector(0, 0, 30)}), dvl(300)], "", {},
         {"log.warnings": "imu: 1 angular rate stands out from both neighbours, by 30 rad/s"}),
@@ -143,15 +152,12 @@ CASES: dict[str, Case] = {
         [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
         {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3}, {"log.depth": None}),
     # reference poses
-    "truth by its name": (
-        [poses(TURN)], "", {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3}, {}),
     **{f"odometry {chosen or 'by its name'}": (
         [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
         chosen, {"truth.positions": [(1, 2, 3)] * 3}, {"log.truth": None})
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
-    "odometry of another name": (
-        [poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry")], "", {}, {"log.truth": "/odom only if chosen"}),
-    "pose of another name": ([poses(TURN, topic="/pose")], "", {}, {"log.truth": "/pose only if chosen"}),
+    **{f"a pose at {entry[0]}": ([entry], "", {}, {"log.truth": f"{entry[0]} only if chosen"})
+       for entry in (poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose"))},
     # landmarks
     "positions as range and azimuth, results as the posterior": (
         [arrays(*FRAMES)], "",
@@ -205,7 +211,7 @@ GRAVITY: dict[tuple[float, ...], str | None] = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_messages_of_any_driver_become_measurements(foreign: Any, case: Case) -> None:
+def test_messages_of_any_driver_become_measurements(foreign, case):
     sequence = foreign.check(*case)
     assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
     if (
@@ -218,8 +224,8 @@ def test_messages_of_any_driver_become_measurements(foreign: Any, case: Case) ->
 
 @pytest.mark.parametrize(("force", "warning"), GRAVITY.items(), ids=str)
 def test_gravity_along_another_axis_is_reported_with_its_rotation(
-    foreign: Any, force: tuple[float, ...], warning: str | None
-) -> None:
+    foreign, force, warning
+):
     notes = foreign.check(
         [imu(force=force), dvl()], FRD_DVL, {}, {"log.doubtful": warning}
     ).notes
@@ -240,12 +246,12 @@ def test_gravity_along_another_axis_is_reported_with_its_rotation(
     ("toml", "recorded", "position", "expected"), AXES.values(), ids=AXES
 )
 def test_axes_of_world_and_body_become_ours(
-    foreign: Any,
-    toml: str,
-    recorded: Rotation,
-    position: list[float],
-    expected: Rotation,
-) -> None:
+    foreign,
+    toml,
+    recorded,
+    position,
+    expected,
+):
     truth = foreign.read(poses(recorded), toml=toml).truth
     np.testing.assert_array_equal(truth.positions, [position] * 3)
     np.testing.assert_allclose(
@@ -253,14 +259,11 @@ def test_axes_of_world_and_body_become_ours(
     )
 
 
-def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(n, 6, 6))
-    return root @ root.transpose(0, 2, 1), Rotation.random(n, rng).as_matrix()
-
-
-def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
-    covariances, rotations = random_covariances(1, 1)
+def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(1, 6, 6))
+    covariances = root @ root.transpose(0, 2, 1)
+    rotations = Rotation.random(1, rng).as_matrix()
     pose = gtsam.Pose3(gtsam.Rot3(rotations[0]), np.array([1.0, 2, 3]))
     samples = np.random.default_rng(2).multivariate_normal(
         np.zeros(6), covariances[0] * 1e-8, 20_000
@@ -282,17 +285,13 @@ def test_a_covariance_for_ros_is_that_of_sampled_poses_in_fixed_axes() -> None:
 
 
 @pytest.mark.parametrize(("entry", "toml", "message"), REFUSED.values(), ids=REFUSED)
-def test_results_that_are_no_detections_are_refused(
-    foreign: Any, entry: Entry, toml: str, message: str
-) -> None:
+def test_results_that_are_no_detections_are_refused(foreign, entry, toml, message):
     with pytest.raises(LogError, match=message):
         foreign.read(entry, toml=toml)
 
 
 @given(st.tuples(*[st.floats(-10, 10)] * 3), st.integers(0, 1000))
-def test_the_covariance_is_that_of_many_samples_to_first_order(
-    position: tuple[float, ...], seed: int
-) -> None:
+def test_the_covariance_is_that_of_many_samples_to_first_order(position, seed):
     assume(np.hypot(*position[:2]) > 0.5)
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, 3)) * 1e-4
