@@ -17,7 +17,7 @@ from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
-from .test_sensor_check import line_of
+from .runs import line_of
 
 WORLD = simulate_mission(MissionOptions(duration_s=90.0, landmarks=1))
 MOUNTED = Mounting(rpy_rad=(0.3, -0.2, 1.0))

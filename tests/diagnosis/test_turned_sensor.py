@@ -14,7 +14,7 @@ from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
-from .test_sensor_check import line_of
+from .runs import line_of
 
 WORLD = simulate_mission(MissionOptions(seed=4, duration_s=60, landmarks=40))
 OTHER = {"imu": "dvl", "dvl": "imu"}
