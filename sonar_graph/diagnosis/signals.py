@@ -16,7 +16,7 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,9 +63,14 @@ class SignalStretch:
     beside: Callable[[Floats], Values] | None = None
     """What else may move the sensor, shape (n, q), by the table of checks."""
 
+    @property
+    def x(self) -> Values:
+        """Reference at the rows, shape (n,)."""
+        return self.shifted(np.zeros(1))[0]
+
     def excess(self) -> "SignalStretch":
         """What the sensor has beyond its reference, ``y - x``, as a signal of its own."""
-        return replace(self, y=self.y - self.shifted(np.zeros(1))[0])
+        return replace(self, y=self.y - self.x)
 
     def shifted(self, lags_s: Floats) -> Values:
         """Reference at the rows for each lag, shape (k, n)."""
@@ -250,20 +255,16 @@ def refined(
     find_lag: bool,
 ) -> Match:
     """Fits about the best lag, with the derivative by the lag; means of the stretches by their certainty."""
-    gains = list[tuple[float, float]]()
-    angles = list[tuple[float, float]]()
-    lags = list[tuple[float, float]]()
+    gains, angles, lags = (list[tuple[float, float]]() for _ in range(3))
     residuals = list[Values]()
     for stretch in stretches:
+        x = stretch.shifted(np.array([lag_s]))[0]
+        columns = np.column_stack([x, stretch.slope(lag_s)] if find_lag else [x])
         # one candidate: the grid has chosen the lag and the sense
-        x = stretch.shifted(np.array([lag_s]))[:, :, None]  # (1, n, 1)
-        x = x.conj() if is_mirrored else x
-        found = RobustFit.of(x, stretch, drift_sigma)
+        columns = (columns.conj() if is_mirrored else columns)[None]  # (1, n, p)
+        found = RobustFit.of(columns[:, :, :1], stretch, drift_sigma)
         if find_lag:
-            slope = stretch.slope(lag_s)[None, :, None]
-            slope = slope.conj() if is_mirrored else slope
             # a far row with a large slope would make a delay of its own
-            columns = np.concatenate([x, slope], axis=2)  # (1, n, 2)
             found = RobustFit.of(columns, stretch, drift_sigma, found.kept)
         if not found.rows[0]:
             continue
@@ -313,11 +314,6 @@ class Explained:
         size = float(np.linalg.norm(self.q / np.maximum(self.sigmas, 1e-12)))
         return size > ACTING_SIGMAS and self.before > CLEARLY_BETTER * self.after
 
-    @property
-    def error(self) -> float:
-        """Root mean square of what the columns explain, in the sensor's unit."""
-        return float(np.sqrt(max(self.before**2 - self.after**2, 0.0)))
-
 
 def explained(
     stretches: Iterable[SignalStretch],
@@ -328,9 +324,7 @@ def explained(
 
     None where some stretch is too short.
     """
-    found = list[tuple[Values, Floats]]()
-    before = list[Values]()
-    after = list[Values]()
+    values, precisions, before, after = (list[Any]() for _ in range(4))
     for stretch in stretches:
         excess = stretch.excess()
         A = columns(stretch)  # (n, q)
@@ -339,17 +333,18 @@ def explained(
         fit = RobustFit.of(A[None], excess, 0.0)
         if not fit.rows[0]:
             return None
-        found.append((fit.p[0, :wanted], fit.sigmas()[:wanted]))
+        values.append(fit.p[0, :wanted])
+        precisions.append(np.maximum(fit.sigmas()[:wanted], 1e-12) ** -2)
         # of the same rows, so that an outlier is not what was explained
         before.append(without.residuals[0, fit.kept[0]])
         after.append(fit.residuals[0, fit.kept[0]])
-    if not found:
+    if not values:
         return None
-    q = np.array([values for values, _ in found])  # (stretches, q)
-    weights = np.array([np.maximum(sigmas, 1e-12) ** -2 for _, sigmas in found])
-    mean = np.sum(weights * q, axis=0) / np.sum(weights, axis=0)
-    sigmas = 1.0 / np.sqrt(np.sum(weights, axis=0))
-    return Explained(mean, sigmas, root_mean_square(before), root_mean_square(after))
+    weights = np.array(precisions)  # (stretches, q)
+    total = np.sum(weights, axis=0)
+    mean = np.sum(weights * np.array(values), axis=0) / total
+    left = (root_mean_square(before), root_mean_square(after))
+    return Explained(mean, 1.0 / np.sqrt(total), *left)
 
 
 class SignalStep(NamedTuple):
@@ -419,7 +414,7 @@ def centred(values: Values, stretch: SignalStretch) -> Values:
 
 def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
     """Reference at the rows about its mean, or about a line, shape (n,)."""
-    x = stretch.shifted(np.zeros(1))[0]
+    x = stretch.x
     if not has_drift:
         return centred(x, stretch)
     known = np.isfinite(x)

@@ -63,20 +63,13 @@ def test_signs_of_the_doppler_log_are_found_and_the_gyros_left_alone(
     assert found_axes(with_axes(IDENTITY, P)) == (IDENTITY.tolist(), P.tolist())
 
 
-@pytest.mark.parametrize(
-    "axes",
-    [
-        [(-1, 0, 0), (0, 1, 0), (0, 0, 1)],
-        [(1, 0, 0), (0, -1, 0), (0, 0, 1)],
-        [(0, 1, 0), (1, 0, 0), (0, 0, 1)],
-        [(0, -1, 0), (1, 0, 0), (0, 0, 1)],
-    ],
-)
+@pytest.mark.parametrize("signs", [(1, 1), (1, -1)])
+@pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2]])
 def test_level_axes_of_the_accelerometers_are_found_with_a_doppler_log_on_a_long_arm(
-    axes: list[tuple[float, float, float]],
+    signs: tuple[float, float], order: list[int]
 ) -> None:
     """Rates and velocities agree and so does the arm between them: in the forces' axes it is turned as they are."""
-    S = np.array(axes, dtype=np.float64)
+    S = np.diag([*signs, 1.0])[order]
     arm_m = np.array([0.6, 0.4, 0.2])
     body_R_imu = WORLD.calibration.imu.mounting.pose().rotation().matrix()
     columns = (WORLD.imu.angular_velocity @ body_R_imu.T).T

@@ -18,9 +18,9 @@ from sonar_graph.diagnosis import Finding
 from sonar_graph.diagnosis.start import (
     StartTilt,
     bias_findings,
-    find_start_heading,
     find_start_tilt,
     lever_findings,
+    start_heading_finding,
     tilt_findings,
     with_bias,
     with_fitted,
@@ -267,8 +267,9 @@ def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float
     reference = Trajectory.without_covariances(
         stamps_ns, np.zeros((len(t), 3)), turning
     )
-    found = find_start_heading(run, reference, Estimate1D(0.0, 0.1))
-    assert found.error.sigma == pytest.approx(np.hypot(np.radians(0.1), 0.01), rel=1e-6)
-    assert found.rpy_rad[2] == pytest.approx(
-        0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6
-    )
+    offset = Estimate1D(0.0, 0.1)
+    no_tilt = StartTilt(None, "no rows")
+    found, yaw_rad = start_heading_finding(run, reference, offset, no_tilt)
+    sigma = np.hypot(0.1, np.degrees(0.01))
+    assert found.estimate.sigma == pytest.approx(sigma, rel=1e-6)
+    assert yaw_rad == pytest.approx(0.1 * max(begin_s, 0.0), abs=1e-6)

@@ -14,7 +14,7 @@ from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_un
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.vehicle_setup import unplaced
 from sonar_graph.measurements import Floats, Imu
-from sonar_graph.navigation.alignment import DvlMatch, Estimate1D, InitialTilt
+from sonar_graph.navigation.alignment import Estimate1D, InitialTilt
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -200,12 +200,11 @@ def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told:
 def test_the_bias_of_smaller_sigma_wins_axis_by_axis():
     unknown = Estimate1D(np.nan, np.inf, "too little turning")
     driven = (Estimate1D(1.0, 1e-4), Estimate1D(2.0, 1e-2), unknown)
-    drive = replace(DvlMatch.unknown("unused"), gyro_bias=driven)
     cov = np.diag(np.square([1.0, 1.0, 1e-3, 1e-3, 1e-3]))
     known = np.ones(3, dtype=np.bool_)
     rest = InitialTilt(0, 0.0, 0.0, np.array([10.0, 20.0, 30.0]), cov, known)
     still = StartTilt(rest, "from 20 s of rest", is_rest=True)
-    bias, sources = sensor_check.surest_bias(drive, still)
+    bias, sources = sensor_check.surest_bias(driven, still)
     assert [one.value for one in bias] == [1.0, 20.0, 30.0]
     # a bias that changed is one row with both numbers
     assert sources == (
@@ -214,7 +213,7 @@ def test_the_bias_of_smaller_sigma_wins_axis_by_axis():
         "from 20 s of rest",
     )
     moving = StartTilt(rest, "from 60 s in motion")
-    bias, sources = sensor_check.surest_bias(drive, moving)
+    bias, sources = sensor_check.surest_bias(driven, moving)
     assert (bias, set(sources)) == (driven, {"from the turns of the drive"})
 
 

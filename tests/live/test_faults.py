@@ -18,9 +18,10 @@ from sonar_graph.live import (
     definition_of,
     inbox,
     open_session,
+    play_messages,
     subscribe,
 )
-from sonar_graph.live.outlets import ZenohOutlet
+from sonar_graph.live.outlets import zenoh_outlet
 from sonar_graph.logs import LiveRecord
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from tests.live.traffic import free_endpoint, messages_of
@@ -52,40 +53,30 @@ def messages(tmp_path):
     return messages_of(tmp_path / "log.mcap", np.random.default_rng(0), 0.0)
 
 
-class Robot(threading.Thread):
-    """Router and sender of messages, `PACE` times as fast as they were recorded."""
+def robot(endpoint, messages, wait=lambda _: None):
+    """Router and sender of messages, `PACE` times as fast as they were recorded: a thread, and its session."""
+    session = open_session(listen=[endpoint])
+    kinds = {m.topic: m.type_name for m in messages}
+    publishers = {
+        topic: Publisher(session, 0, topic, kind) for topic, kind in kinds.items()
+    }
 
-    def __init__(self, endpoint, messages, pace_at=lambda _: PACE):
-        super().__init__(daemon=True)
-        self.is_done = threading.Event()
-        self.session = open_session(listen=[endpoint])
-        self._messages = messages
-        self._pace_at = pace_at
-        kinds = {m.topic: m.type_name for m in messages}
-        self._publishers = {
-            topic: Publisher(self.session, 0, topic, kind)
-            for topic, kind in kinds.items()
-        }
+    def put(message):
+        wait(message)
+        publishers[message.topic].put(message.payload)
 
-    def run(self):
-        before_ns = self._messages[0].arrival_ns
-        due_s = time.monotonic()
-        for message in self._messages:
-            pace = self._pace_at(at_s(self._messages, message))
-            due_s += (message.arrival_ns - before_ns) * 1e-9 / pace
-            before_ns = message.arrival_ns
-            time.sleep(max(0.0, due_s - time.monotonic()))
-            self._publishers[message.topic].put(message.payload)
-        self.is_done.set()
+    sent = (iter(messages), PACE, put, lambda: False)
+    return threading.Thread(target=play_messages, args=sent, daemon=True), session
 
 
-def lived(folder, endpoint, robot, said):
+def lived(folder, endpoint, sender, said):
     """The outcome of a live run on what a robot sends, and its counts."""
+    robot, router = sender
     options = LiveOptions("ekf-slam", lateness_s=1.0)
     with ExitStack() as stack:
         session = stack.enter_context(open_session([endpoint]))
         record = stack.enter_context(LiveRecord(folder / "record.mcap"))
-        outlets = [ZenohOutlet(session, 0)]
+        outlets = [zenoh_outlet(session, 0)]
         run = stack.enter_context(
             LiveRun(record, definition_of, options, outlets, said.append)
         )
@@ -93,7 +84,7 @@ def lived(folder, endpoint, robot, said):
         time.sleep(0.5)
         robot.start()
         last_s = time.monotonic() + 90
-        while not robot.is_done.is_set() and time.monotonic() < last_s:
+        while robot.is_alive() and time.monotonic() < last_s:
             run.turn()
         until_s = time.monotonic() + 2.0
         while time.monotonic() < until_s:
@@ -102,7 +93,7 @@ def lived(folder, endpoint, robot, said):
             one.undeclare()
         outcome = run.finish()
         counts = run.counts()
-    robot.session.close()
+    router.close()
     return outcome, counts
 
 
@@ -132,13 +123,16 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
     def is_gone(message):
         return message.topic == "/dvl/data" and 8 < at_s(messages, message) < 14
 
-    def pace_at(at_s):
+    def wait(message):
         """A loaded machine takes longer to notice: the gap lasts until it has."""
-        is_noticed = any(line.startswith("/dvl/data: nothing") for line in said)
-        return 0.3 if 8 < at_s < 14 and not is_noticed else PACE
+        last_s = time.monotonic() + 20
+        while at_s(messages, message) > 13 and time.monotonic() < last_s:
+            if any(line.startswith("/dvl/data: nothing") for line in said):
+                return
+            time.sleep(0.05)
 
     left = [message for message in messages if not is_gone(message)]
-    outcome, counts = lived(tmp_path, endpoint, Robot(endpoint, left, pace_at), said)
+    outcome, counts = lived(tmp_path, endpoint, robot(endpoint, left, wait), said)
     assert any(line.startswith("/dvl/data: nothing since") for line in said)
     assert not counts["lost"]
     assert_equals_log(outcome, tmp_path, 150)
@@ -148,13 +142,18 @@ def test_a_burst_at_ten_times_the_pace_beside_a_stalled_viewer_loses_nothing(
     tmp_path, endpoint, messages
 ):
     """A subscriber that is stopped does not hold up poses for another, nor the run."""
-    robot = Robot(endpoint, messages, lambda at_s: 10 * PACE if 8 < at_s < 14 else PACE)
+    first_ns = messages[0].arrival_ns
+    burst_s = (0.0, 8.0, 8.6, 20.0)
+    come = []
+    for message in messages:
+        due_s = np.interp(at_s(messages, message), (0.0, 8.0, 14.0, 25.4), burst_s)
+        come.append(message._replace(arrival_ns=first_ns + int(due_s * 1e9)))
     arrived = []
     with stalled(endpoint), open_session([endpoint]) as session:
         subscriber = session.declare_subscriber(
             "0/sonar_graph/odometry/**", lambda _: arrived.append(time.monotonic())
         )
-        outcome, counts = lived(tmp_path, endpoint, robot, [])
+        outcome, counts = lived(tmp_path, endpoint, robot(endpoint, come), [])
         subscriber.undeclare()
     assert not counts["lost"]
     assert sum(counts["received"].values()) == len(messages)

@@ -4,6 +4,7 @@ import struct
 import threading
 import time
 from contextlib import ExitStack
+from itertools import count
 
 import mcap_ros2._dynamic as ros2
 import numpy as np
@@ -19,10 +20,11 @@ from sonar_graph.live import (
     definition_of,
     open_link,
     open_session,
+    play_messages,
     subscribe,
 )
 from sonar_graph.live.foxglove_link import FoxgloveLink
-from sonar_graph.live.outlets import DETECTED, TOPICS, ZenohOutlet
+from sonar_graph.live.outlets import DETECTED, TOPICS, zenoh_outlet
 from sonar_graph.live.zenoh_link import parse_key, topic_key, type_hash
 from sonar_graph.logs import LiveRecord, PartialCalibration
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -69,16 +71,16 @@ def foreign_publisher(endpoint, messages, ready):
     with zenoh.open(config) as session:
         ready["router"].set()
         ready["subscribed"].wait(60)
-        first_ns = messages[0].arrival_ns
-        begun_s = time.monotonic()
-        for number, message in enumerate(messages):
-            due_s = begun_s + (message.arrival_ns - first_ns) * 4e-10
-            time.sleep(max(0.0, due_s - time.monotonic()))
+        numbers = count()
+
+        def put(message):
             package, _, name = message.type_name.split("/")
             key = f"0{message.topic}/{package}::msg::dds_::{name}_/RIHS01_{'0' * 64}"
-            sender = message.topic.encode().ljust(16)[:16]
-            attachment = struct.pack("<qqB16s", number, time.time_ns(), 16, sender)
+            about = (next(numbers), time.time_ns(), 16, message.topic.encode())
+            attachment = struct.pack("<qqB16s", *about)
             session.put(key, message.payload, attachment=attachment)
+
+        play_messages(iter(messages), 2.5, put, lambda: False)
         ready["done"].set()
         ready["end"].wait(60)
 
@@ -111,7 +113,7 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
             known = mission.calibration.model_dump(mode="json")
             given = PartialCalibration(known, "of the mission")
             options = LiveOptions("ekf-slam", lateness_s=1.0, calibration=given)
-            outlets = [ZenohOutlet(session, 0)]
+            outlets = [zenoh_outlet(session, 0)]
             run = stack.enter_context(
                 LiveRun(record, definition_of, options, outlets, lambda _: None)
             )
