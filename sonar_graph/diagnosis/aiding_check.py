@@ -51,7 +51,6 @@ from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
-    STEP_RATIO,
     Match,
     Values,
     explained,
@@ -98,6 +97,8 @@ LEAST_MOVED = 1.0
 STUCK_MOVED = 10.0
 """The same for a sensor that is stuck."""
 STEP_GAIN_ERROR = 0.1
+STEP_RATIO = 3.0
+"""Steps of a sensor over those of its motion, from which on they are none of the motion."""
 MOST_MISFIT = 0.3
 """Share of its changes that the reference does not explain, from which on a sensor contradicts it."""
 LARGEST_SCATTER = 10.0
@@ -762,8 +763,9 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
         return
     is_level = fixes.covariance_m2[:, 2, 2] >= 0.5 * UNMEASURED_M2
     fixes = fixes.rows(np.flatnonzero(fixes.are_sound() & ~is_level))
-    outside = {"left": np.nan, "right": np.nan}
-    by_depth = np.interp(fixes.stamps_ns, depth.stamps_ns, depth.z_m, **outside)
+    by_depth = np.interp(
+        fixes.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan
+    )
     off = fixes.position_m[:, 2] - by_depth
     off = off[np.isfinite(off)]
     if len(off) < NEAR_START:

@@ -141,9 +141,8 @@ class BodyMotion:
             is_between = self.parts[after] != self.parts[after - 1]
             # the first row of a part belongs to it
             is_between &= self.seconds[after] != seconds
-            is_outside = (seconds < self.seconds[0]) | (seconds > self.seconds[-1])
-            found = np.interp(seconds, self.seconds, values)
-            return np.where(is_between | is_outside, np.nan, found)
+            found = np.interp(seconds, self.seconds, values, left=np.nan, right=np.nan)
+            return np.where(is_between, np.nan, found)
 
         return at
 

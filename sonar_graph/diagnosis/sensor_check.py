@@ -8,7 +8,6 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -220,7 +219,12 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
-    sequence = without_gravity(without_stuck(sequence))
+    sequence = without_stuck(sequence)
+    if lacks_gravity(sequence):
+        # as if its owner had stated so
+        update = {"use_gravity": False}
+        calibration = sequence.calibration.model_copy(update=update)
+        sequence = replace(sequence, calibration=calibration)
     if reason := spoilt_by(sequence):
         return [Finding("sensors with each other", unknown(reason))]
     if coarse := coarse_findings(sequence):
@@ -235,16 +239,17 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         axes.append(pair.finding(YAW, in_degrees(match.turn[2]), TURNED))
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    # no other comparison is worth anything beside gyros that are wrong
-    if rates := rate_findings(sequence, config):
+    # gyros or velocities that are wrong by themselves are no reference for others
+    alone = (turn_rate_finding(sequence, config), velocity_steps(sequence))
+    if rates := [finding for finding in alone if finding is not None]:
         return [*forces, *axes, *rates]
     leaning, sequence = leaning_pair(match, sequence)
     if leaning:
         axes += leaning
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    tilting, unbiased = accel_bias_findings(match, sequence.calibration)
+    tilting, calibration = accel_bias_findings(match, sequence.calibration)
     axes += tilting
-    sequence = replace(sequence, calibration=unbiased)
+    sequence = replace(sequence, calibration=calibration)
     x, y, z = (
         replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias
     )
@@ -357,12 +362,6 @@ def drifting_role(sequence: Sequence) -> str:
     return roles.pop() if len(roles) == 1 else ""
 
 
-def rate_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Gyros or velocities that are wrong by themselves, so that they are no reference for others."""
-    found = (turn_rate_finding(sequence, config), velocity_steps(sequence))
-    return [finding for finding in found if finding is not None]
-
-
 def by_late_imu(
     of_dvl: list[Finding], by_motion: list[Finding], config: LogConfig
 ) -> tuple[list[Finding], list[Finding]]:
@@ -410,26 +409,16 @@ def without_stuck(sequence: Sequence) -> Sequence:
     return replace(sequence, imu=imu.rows(of_imu), dvl=dvl.rows(of_dvl))
 
 
-def without_gravity(sequence: Sequence) -> Sequence:
-    """The sequence as if its owner had stated so, where gravity was taken out of the specific forces."""
-    if not lacks_gravity(sequence):
-        return sequence
-    calibration = sequence.calibration.model_copy(update={"use_gravity": False})
-    return replace(sequence, calibration=calibration)
-
-
 def force_findings(
     sequence: Sequence, config: LogConfig
 ) -> tuple[list[Finding], Sequence]:
     """Scale of the accelerometers by gravity, and the sequence with the scale put right."""
     found = force_scale(sequence, config)
-    if found is None:
-        return [], sequence
-    if found.acts:
+    if found is not None and found.acts:
         imu = sequence.imu
         force = imu.specific_force / found.estimate.value
         sequence = replace(sequence, imu=replace(imu, specific_force=force))
-    return [found], sequence
+    return [found] if found else [], sequence
 
 
 def tried_axes(sequence: Sequence, config: LogConfig) -> tuple[list[Finding], Sequence]:
@@ -638,10 +627,10 @@ def motion_findings(
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
         rightly_turned = scaled_gyros(right, Z_NEGATED)
-    scale = HeadingScale.of(rightly_turned, matches[HEADING])
-    if scale and scale.is_shared and rightly_turned is right:
+    scaled, apart = with_scale_of_heading(rightly_turned, matches[HEADING])
+    if rightly_turned is right and scaled is not right:
         found += heading_findings(matches[HEADING], right, config, motion)
-        rightly_turned = scaled_gyros(right, scale.gain * np.eye(3))
+        rightly_turned = scaled
     if rightly_turned is not right:
         right = rightly_turned
         motion = BodyMotion.of(right)
@@ -662,7 +651,7 @@ def motion_findings(
             found += findings_of(check, match, right, config)
     named = {f.quantity for f in found}
     of_heading = [
-        f if scale is None else scale.judged(f)
+        judged_scale(f, apart)
         for f in heading_findings(matches[HEADING], right, config, motion)
         if f.quantity not in named
     ]
@@ -730,36 +719,32 @@ def names_of_opposite(
     ]
 
 
-class HeadingScale(NamedTuple):
-    """Scale of the heading over the gyros, and what other sensors make of gyros that are scaled by as much."""
+def with_scale_of_heading(
+    right: Sequence, of_heading: Match | None
+) -> tuple[Sequence, str]:
+    """The sequence with gyros scaled as the heading has it, where others bear that out, and the sensors that contradict it.
 
-    gain: float
-    apart: str
-    """Names of sensors that agree with such gyros less; empty without any."""
-    is_shared: bool
-    """True where azimuths or fixes agree with them better, and no sensor less: the gyros are wrong."""
+    Azimuths or fixes must agree with such gyros better, and no sensor less.
+    """
+    if of_heading is None or of_heading.misfit >= MOST_MISFIT:
+        return right, ""
+    gain = of_heading.gain
+    is_off = matters(gain.minus(1.0), HEADING.least_scale)
+    if not (is_off and 1 / OTHER_UNIT < gain.value < OTHER_UNIT):
+        return right, ""
+    scaled = scaled_gyros(right, gain.value * np.eye(3))
+    apart = brought_apart(right, scaled)
+    nearer = brought_apart(scaled, right)
+    is_shared = AZIMUTH.name in nearer or POSITIONS.name in nearer
+    return (scaled if is_shared and not apart else right), apart
 
-    @classmethod
-    def of(cls, right: Sequence, of_heading: Match | None) -> "HeadingScale | None":
-        """None where the heading turns as the gyros do, or not by a scale."""
-        if of_heading is None or of_heading.misfit >= MOST_MISFIT:
-            return None
-        gain = of_heading.gain
-        is_off = matters(gain.minus(1.0), HEADING.least_scale)
-        if not (is_off and 1 / OTHER_UNIT < gain.value < OTHER_UNIT):
-            return None
-        scaled = scaled_gyros(right, gain.value * np.eye(3))
-        apart = brought_apart(right, scaled)
-        nearer = brought_apart(scaled, right)
-        by_others = AZIMUTH.name in nearer or POSITIONS.name in nearer
-        return cls(gain.value, apart, by_others and not apart)
 
-    def judged(self, finding: Finding) -> Finding:
-        """The row of the heading's scale, which is its own where other sensors agree with the gyros."""
-        if not (self.apart and finding.acts and finding.quantity == HEADING.quantity):
-            return finding
-        cause = f"the gyros fit {self.apart} as they are: the heading has a wrong scale, or deviates with its direction"
-        return replace(finding, cause=cause, line=unused(HEADING.role))
+def judged_scale(finding: Finding, apart: str) -> Finding:
+    """The row of the heading's scale, which is its own where other sensors agree with the gyros as they are."""
+    if not (apart and finding.acts and finding.quantity == HEADING.quantity):
+        return finding
+    cause = f"the gyros fit {apart} as they are: the heading has a wrong scale, or deviates with its direction"
+    return replace(finding, cause=cause, line=unused(HEADING.role))
 
 
 def dvl_findings(

@@ -42,7 +42,6 @@ STEP_SIGMAS = 10.0
 """Far beyond the largest of a long log's differences by noise, also where it has heavy tails."""
 LEAST_STEP = 4.0
 """In sigmas of a row: a coarse sensor has no typical difference."""
-STEP_RATIO = 3.0
 MOST_STEPS = 5
 SMALL_SAMPLE = 1.2
 """Quantile of Student's t for a dozen blocks over that of the normal distribution, between 2 and 4 sigma."""
@@ -357,7 +356,7 @@ class SignalStep(NamedTuple):
 
 
 def steps(
-    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float = STEP_RATIO
+    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float
 ) -> list[SignalStep]:
     """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_graph.calibration import Start
 from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Heading, Ints, PositionFixes
@@ -27,6 +28,11 @@ def recalibrated(run: Sequence, role: str, **values: Any) -> Sequence:
     """The run with other values in a section of its calibration."""
     section = getattr(run.calibration, role).model_copy(update=values)
     calibration = run.calibration.model_copy(update={role: section})
+    return replace(run, calibration=calibration)
+
+
+def started(run: Sequence, start: Start) -> Sequence:
+    calibration = run.calibration.model_copy(update={"start": start})
     return replace(run, calibration=calibration)
 
 

@@ -24,6 +24,7 @@ from .runs import (
     names,
     recalibrated,
     spoilt,
+    started,
     true_yaw,
     with_mounting,
 )
@@ -207,8 +208,7 @@ def test_heights_that_do_not_begin_at_the_stated_start_or_under_water_are_told(
 ):
     start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
     heights_m = RIGHT.depth.z_m + z_m - float(RIGHT.depth.z_m[:5].mean())
-    calibration = RIGHT.calibration.model_copy(update={"start": start})
-    run = replace(spoilt(RIGHT, "depth", z_m=heights_m), calibration=calibration)
+    run = started(spoilt(RIGHT, "depth", z_m=heights_m), start)
     found = list(aiding_check.start_depth_findings(run))
     assert [finding.acts for finding in found] == [True] * is_told
     # a height that nothing contradicts may be one over the bottom
@@ -288,7 +288,7 @@ def test_first_headings_far_from_a_stated_start_are_grave(
     run = compass(RIGHT, lambda yaw_rad: yaw_rad + off_rad)
     yaw_rad = float(true_yaw(RIGHT)[0])
     start = Start(rpy_rad=(0.0, 0.0, yaw_rad)) if is_stated else Start()
-    run = replace(run, calibration=run.calibration.model_copy(update={"start": start}))
+    run = started(run, start)
     found = list(aiding_check.start_heading_findings(run, BodyMotion.of(run)))
     assert [finding.grave for finding in found] == [True] * is_named
     for finding in found:

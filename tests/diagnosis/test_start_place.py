@@ -5,19 +5,14 @@ from dataclasses import replace
 import pytest
 
 from sonar_graph.calibration import Start
-from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
-from .runs import grave, names
+from .runs import grave, names, started
 
 BASIN = simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1))
 UNKNOWN = replace(BASIN, truth=None)
 PLACE = BASIN.calibration.start.position_m
 YAW_RAD = BASIN.calibration.start.rpy_rad[2]
-
-
-def started(run: Sequence, start: Start) -> Sequence:
-    return replace(run, calibration=run.calibration.model_copy(update={"start": start}))
 
 
 def stated(

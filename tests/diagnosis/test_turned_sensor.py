@@ -1,6 +1,5 @@
 """A turn between IMU and Doppler log: the turned one is named where something else shows it, else both are."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +18,7 @@ from .runs import (
     fixed,
     grave,
     line_of,
+    lines_of,
     recalibrated,
     spoilt,
     with_mounting,
@@ -90,7 +90,7 @@ def swaying() -> Sequence:
 @pytest.mark.parametrize("is_stated", [True, False])
 @pytest.mark.parametrize(
     ("role", "axis", "angle_rad"),
-    [("imu", "x", 0.2), ("dvl", "x", -0.5), ("imu", "y", -0.5), ("dvl", "y", 0.1)],
+    [("imu", "x", 0.2), ("imu", "y", -0.5), ("dvl", "y", 0.1)],
 )
 def test_a_stated_start_shows_which_is_rolled_or_pitched(
     role: str, axis: str, angle_rad: float, is_stated: bool
@@ -100,16 +100,12 @@ def test_a_stated_start_shows_which_is_rolled_or_pitched(
     finding, *others = grave(with_turned(run, role, angle_rad, axis))
     # a start that nobody states would be measured by the turned IMU
     assert not (is_stated and others)
-    assert finding.quantity.endswith(
-        {"x": "mounting roll", "y": "mounting pitch"}[axis]
-    )
-    lines = re.findall(r"`(\w+)\.mounting\.rpy_rad = \[(.*?)\]`", finding.line)
-    found = {name: [float(angle) for angle in text.split(",")] for name, text in lines}
-    assert set(found) == ({role} if is_stated else {"imu", "dvl"})
-    roll, pitch, yaw = found[role]
-    turned = {"x": roll, "y": pitch}[axis]
-    assert turned == pytest.approx(angle_rad, abs=0.02)
-    assert abs(roll) + abs(pitch) + abs(yaw) - abs(turned) < 0.04
+    assert finding.quantity.endswith({"x": " roll", "y": " pitch"}[axis])
+    found = {name: line for one in lines_of(finding) for name, line in one.items()}
+    assert found.keys() == ({role} if is_stated else {"imu", "dvl"})
+    expected = np.multiply(angle_rad, [axis == "x", axis == "y", False])
+    angles_rad = found[role]["mounting"]["rpy_rad"]
+    assert angles_rad == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize("bias_m_s2", [(0.1, 0.0, 0.0), (0.0, -0.4, 0.0)])
