@@ -241,9 +241,13 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
 
 def is_level_fix(fixes: PositionFixes) -> NDArray[np.bool_]:
     """Mask of fixes whose level coordinates are measured, shape (n,)."""
-    variances = np.einsum("nii->ni", fixes.covariance_m2)[:, :2]
-    is_unmeasured = (variances >= 0.5 * UNMEASURED_M2).any(axis=1)
-    return np.asarray(fixes.are_sound() & ~is_unmeasured)
+    return np.asarray(fixes.are_sound() & ~are_unmeasured(fixes)[:, :2].any(axis=1))
+
+
+def are_unmeasured(fixes: PositionFixes) -> NDArray[np.bool_]:
+    """Mask of coordinates that a fix states as not measured, shape (n, 3)."""
+    variances = np.einsum("nii->ni", fixes.covariance_m2)
+    return np.asarray(variances >= 0.5 * UNMEASURED_M2)
 
 
 def sighting_match(
@@ -422,9 +426,10 @@ def fix_sigma_m(sequence: Sequence) -> tuple[float, float, float]:
     known = sequence.positions
     if known is not None:
         variances = np.einsum("nii->ni", known.covariance_m2)
-        variances = variances[known.are_sound() & np.isfinite(variances).all(axis=1)]
         # a coordinate that is not measured says nothing of those that are
-        measured = np.where(variances < 0.5 * UNMEASURED_M2, variances, np.nan)
+        measured = np.where(are_unmeasured(known), np.nan, variances)
+        stated = known.are_sound() & np.isfinite(variances).all(axis=1)
+        measured = measured[stated]
         if np.isfinite(measured).any(axis=0).all():
             x, y, z = np.sqrt(np.nanmedian(measured, axis=0)).tolist()
             return x, y, z
@@ -761,8 +766,8 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     fixes = sequence.positions
     if depth is None or fixes is None:
         return
-    is_level = fixes.covariance_m2[:, 2, 2] >= 0.5 * UNMEASURED_M2
-    fixes = fixes.rows(np.flatnonzero(fixes.are_sound() & ~is_level))
+    has_height = fixes.are_sound() & ~are_unmeasured(fixes)[:, 2]
+    fixes = fixes.rows(np.flatnonzero(has_height))
     by_depth = np.interp(
         fixes.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan
     )

@@ -88,13 +88,6 @@ class EstimatorRun:
             "detections()": self.detections,
         }
 
-    def causal(self, stamps_ns: list[int]) -> Trajectory:
-        """Causal estimates at some of the instants."""
-        wanted = set(stamps_ns)
-        return Trajectory.from_estimates(
-            [e for e in self.estimates if e.stamp_ns in wanted]
-        )
-
 
 def fresh(make: MakeEstimator, calibration: Calibration) -> Estimator:
     """Estimator that has seen nothing, with an odometry of its own."""
@@ -208,8 +201,9 @@ def deviation(one: EstimatorRun, other: EstimatorRun) -> tuple[float, float]:
 def _at_same_instants(
     one: EstimatorRun, other: EstimatorRun
 ) -> tuple[Trajectory, Trajectory]:
-    stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
-    return one.causal(stamps_ns), other.causal(stamps_ns)
+    wanted = {estimate.stamp_ns for estimate in one.estimates}
+    theirs = [estimate for estimate in other.estimates if estimate.stamp_ns in wanted]
+    return Trajectory.from_estimates(one.estimates), Trajectory.from_estimates(theirs)
 
 
 def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
