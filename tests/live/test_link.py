@@ -51,9 +51,17 @@ def test_a_key_gives_topic_and_type_again():
     assert parse_key("0/some/thing/else") is None
 
 
-def test_an_unreachable_router_is_named():
-    with pytest.raises(LogError, match=r"tcp/127\.0\.0\.1:1: zenoh cannot connect"):
-        open_session(["tcp/127.0.0.1:1"])
+@pytest.mark.parametrize(
+    ("where", "fault"),
+    [
+        ("tcp/127.0.0.1:1", "zenoh cannot connect"),
+        ("ws://127.0.0.1:1", "cannot connect"),
+    ],
+)
+def test_a_router_or_bridge_that_is_not_there_is_named(where, fault):
+    pytest.importorskip("websockets")
+    with pytest.raises(LogError, match=f"{where}: {fault}"):
+        open_link([where], 0)
 
 
 @pytest.fixture
@@ -216,12 +224,6 @@ def until(holds, longest_s=20.0):
     while not holds() and time.monotonic() < last_s:
         time.sleep(0.01)
     assert holds()
-
-
-def test_a_bridge_that_is_not_there_is_named():
-    pytest.importorskip("websockets")
-    with pytest.raises(LogError, match=r"ws://127\.0\.0\.1:1: cannot connect"):
-        open_link(["ws://127.0.0.1:1"], 0)
 
 
 def test_a_router_that_ends_and_comes_back_is_heard_again(endpoint):

@@ -102,19 +102,6 @@ def test_a_record_whose_writer_was_killed_goes_on_as_if_nothing_had_been(tmp_pat
     assert_same_steps(resumed, steps)
 
 
-def test_rows_that_a_slow_estimator_missed_are_not_recorded(tmp_path):
-    messages = messages_from(tmp_path, small_world(), 0.0)
-    with LiveRecord(tmp_path / "record.mcap") as record:
-        engine = Engine(record, definition_of)
-        for message in messages:
-            engine.take(message)
-            for step in engine.steps():
-                left = engine.without_detections(step, message.arrival_ns)
-                assert left.detections is None
-    assert sum(engine.counts.dropped.values()) >= 30
-    assert read_log(tmp_path / "record.mcap").detections is None
-
-
 def test_gaps_of_sequence_numbers_are_losses_by_topic(tmp_path):
     numbers = Counter()
     messages = []

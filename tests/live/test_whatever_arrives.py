@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sonar_graph import write_log
+from sonar_graph import read_log, write_log
 from sonar_graph.devices import velocity_of_beams
 from sonar_graph.live import Engine, Message, definition_of
 from sonar_graph.live.arrivals import MOTION
@@ -339,26 +339,25 @@ def test_what_is_waited_for_is_said_once(tmp_path, messages):
     assert not engine.waits_for
 
 
-def test_detections_that_were_dropped_for_being_behind_are_counted_once(
-    tmp_path, messages
-):
-    """Also where all began anew before, with a sensor that came late."""
-    late = [
-        m
-        for m in messages
-        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
-    ]
-    with LiveRecord(tmp_path / "first.mcap") as record:
+def test_detections_that_a_slow_estimator_missed_are_not_recorded(tmp_path, messages):
+    """They are counted once, also where all began anew before, with a sensor that came late."""
+    late_ns = messages[0].arrival_ns + 5 * NS
+    path = tmp_path / "record.mcap"
+    with LiveRecord(path) as record:
         engine = Engine(record, definition_of)
-        for message in late:
-            engine.take(message)
-            for step in engine.steps():
-                if engine.generation == 1:
-                    for _ in range(2):  # a step is asked for again
-                        engine.without_detections(step, message.arrival_ns)
-    dropped = dropped_messages(tmp_path / "first.mcap")
+        for message in messages:
+            if message.topic != "/depth/pose" or message.arrival_ns > late_ns:
+                engine.take(message)
+            for step in engine.steps() if engine.generation == 1 else ():
+                for _ in range(2):  # a step is asked for again
+                    left = engine.without_detections(step, message.arrival_ns)
+                    assert left.detections is None
+        for step in engine.finish():
+            engine.without_detections(step, message.arrival_ns)
+    dropped = dropped_messages(path)
     assert engine.counts.dropped == {(DETECTIONS, OVERLOADED): len(dropped)}
-    assert dropped
+    assert len(dropped) >= 30
+    assert read_log(path).detections is None
 
 
 def test_rows_that_are_sound_count_beside_others_that_are_not(tmp_path, messages):
