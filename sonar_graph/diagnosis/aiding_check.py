@@ -334,7 +334,7 @@ POSITIONS = Check(
     against="the path by gyros and Doppler log",
     compare=fix_match,
     sigma=lambda sequence: level_sigma_m(fix_sigma_m(sequence)),
-    slow_sigma=lambda sequence: 0.1 * POSITIONS.sigma(sequence),
+    slow_sigma=lambda sequence: 0.1 * level_sigma_m(fix_sigma_m(sequence)),
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda _, config: Advice(
         "north and east are exchanged",

@@ -188,11 +188,11 @@ def turned(Q: Floats, near: Floats) -> Floats:
     """Rotation near a candidate that fits best, shape (3, 3)."""
     from scipy.optimize import minimize
 
-    def rotation(rotvec: Floats) -> Floats:
-        return np.asarray(Rotation.from_rotvec(rotvec).as_matrix() @ near)
+    def square(rotvec: Floats) -> float:
+        return square_of(Q, Rotation.from_rotvec(rotvec).as_matrix() @ near)
 
-    found = minimize(lambda rotvec: square_of(Q, rotation(rotvec)), np.zeros(3))
-    return rotation(found.x)
+    found = minimize(square, np.zeros(3))
+    return np.asarray(Rotation.from_rotvec(found.x).as_matrix() @ near)
 
 
 def square_of(Q: Floats, P: Floats) -> float:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.calibration import Start
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Dvl, Floats, Heading, Ints, PositionFixes
+from sonar_graph.measurements import Dvl, Floats, Heading, Imu, Ints, PositionFixes
 from sonar_graph.sequence import Sequence
 
 
@@ -62,6 +62,23 @@ def heading_rows(stamps_ns: Ints, yaw_rad: Floats) -> Heading:
 
 def fix_rows(stamps_ns: Ints, position_m: Floats) -> PositionFixes:
     return PositionFixes(stamps_ns, position_m, unstated(len(stamps_ns), 3, 3))
+
+
+def level_vehicle(velocity: Floats, yaw_rate: Floats, seed: int) -> Sequence:
+    """A level vehicle by hand, its velocity in the body and its yaw rate at 50 Hz: ``f = dv/dt + w x v + g``, with noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(len(velocity)) / 50.0
+    stamps_ns = np.rint(t * 1e9).astype(np.int64)
+    up = np.array([0.0, 0.0, 1.0])
+    rate = np.outer(yaw_rate, up)
+    force = np.gradient(velocity, t, axis=0) + np.cross(rate, velocity) + 9.80665 * up
+    rate += 1e-3 * rng.standard_normal(rate.shape)
+    force += 1e-2 * rng.standard_normal(force.shape)
+    slow = slice(None, None, 10)
+    noisy = velocity[slow] + 0.01 * rng.standard_normal(velocity[slow].shape)
+    imu = Imu(stamps_ns, rate, force)
+    dvl = dvl_rows(stamps_ns[slow], noisy)
+    return Sequence("by hand", Calibration(), imu, dvl)
 
 
 def true_yaw(run: Sequence) -> Floats:

@@ -3,36 +3,22 @@
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import check_sensors, compared
 from sonar_graph.diagnosis.turn_rate import TURN_RATE
-from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.sequence import Sequence
 
-from .runs import acting, names, spoilt
+from .runs import acting, level_vehicle, names, spoilt
 
 HZ = 50.0
 T = np.arange(0.0, 60.0, 1 / HZ)
 
 
-def level_drive(seed: int, spoil=lambda rate: rate, phase: float = 0.0) -> Sequence:
-    """A level vehicle that turns to and fro: ``f = (dv/dt, w v, g)`` by hand, with noise."""
-    rng = np.random.default_rng(seed)
+def level_drive(seed: int, spoil=np.asarray, phase: float = 0.0) -> Sequence:
+    """A level vehicle that turns to and fro, and speeds up and down."""
     speed = 0.9 + 0.25 * np.sin(0.7 * T + phase)
     yaw_rate = 0.3 * np.sin(0.4 * T + phase) + 0.1
-    zero = np.zeros_like(T)
-    rate = np.outer(yaw_rate, [0.0, 0.0, 1.0])
-    faster = 0.7 * 0.25 * np.cos(0.7 * T + phase)
-    force = np.column_stack([faster, yaw_rate * speed, zero + 9.80665])
-    rate = rate + 1e-3 * rng.standard_normal(rate.shape)
-    force = force + 1e-2 * rng.standard_normal(force.shape)
-    stamps_ns = np.round(T * 1e9).astype(np.int64)
-    rows = slice(0, len(T), 10)
-    velocity = np.outer(speed, [1.0, 0.0, 0.0])[rows]
-    velocity = velocity + 0.01 * rng.standard_normal(velocity.shape)
-    cov = np.tile(1e-4 * np.eye(3), (len(velocity), 1, 1))
-    imu = Imu(stamps_ns, spoil(rate), force)
-    return Sequence("by hand", Calibration(), imu, Dvl(stamps_ns[rows], velocity, cov))
+    run = level_vehicle(np.outer(speed, [1.0, 0.0, 0.0]), yaw_rate, seed)
+    return spoilt(run, "imu", angular_velocity=spoil(run.imu.angular_velocity))
 
 
 def high_passed(rate):

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Start
-from sonar_graph.measurements import Imu
+from sonar_graph.calibration import Start
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .runs import (
     acting,
     compass,
-    dvl_rows,
     fixed,
     grave,
+    level_vehicle,
     line_of,
     lines_of,
     recalibrated,
     spoilt,
+    started,
     with_mounting,
 )
 
@@ -69,22 +69,11 @@ def test_a_third_sensor_shows_which_is_turned_and_its_line_puts_all_right(
 def swaying() -> Sequence:
     """A level vehicle that turns, sways and heaves: velocities along all axes of the body show how it is turned."""
     t = np.arange(0.0, 90.0, 0.02)
-    rng = np.random.default_rng(3)
-    turn = Rotation.from_rotvec(0.8 * np.outer(np.sin(0.2 * t), [0.0, 0.0, 1.0]))
     ahead = 1.0 + 0.2 * np.sin(0.5 * t)
     velocity = np.column_stack([ahead, 0.3 * np.sin(0.9 * t), 0.2 * np.sin(0.7 * t)])
-    acceleration = np.gradient(turn.apply(velocity), t, axis=0)
-    force = turn.inv().apply(np.add(acceleration, [0.0, 0.0, 9.80665]))
-    rate = np.column_stack([0.0 * t, 0.0 * t, 0.16 * np.cos(0.2 * t)])
-    stamps_ns = np.rint(t * 1e9).astype(np.int64)
-    slow = slice(None, None, 10)
-    noisy = velocity[slow] + 0.005 * rng.standard_normal((len(t[slow]), 3))
+    run = level_vehicle(velocity, 0.16 * np.cos(0.2 * t), seed=3)
     start = Start(position_m=(0.0, 0.0, 0.0), rpy_rad=(0.0, 0.0, 0.0))
-    rate = rate + 1e-4 * rng.standard_normal(rate.shape)
-    force = force + 0.01 * rng.standard_normal(force.shape)
-    imu = Imu(stamps_ns, rate, force)
-    dvl = dvl_rows(stamps_ns[slow], noisy)
-    return Sequence("swaying", Calibration(start=start), imu, dvl)
+    return started(run, start)
 
 
 @pytest.mark.parametrize("is_stated", [True, False])
