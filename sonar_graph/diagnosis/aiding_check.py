@@ -36,7 +36,9 @@ from sonar_graph.diagnosis.findings import (
     Finding,
     Gravity,
     contradiction,
+    gravity_of,
     in_degrees,
+    known_values,
     matters,
     numbers,
     other_world,
@@ -49,7 +51,6 @@ from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
 from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
-    STEP_RATIO,
     Match,
     Values,
     explained,
@@ -62,7 +63,13 @@ from sonar_graph.diagnosis.start import (
     turned_mounting,
 )
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import NS_PER_S, UNMEASURED_M2, Floats, PositionFixes
+from sonar_graph.measurements import (
+    NS_PER_S,
+    UNMEASURED_M2,
+    Floats,
+    Ints,
+    PositionFixes,
+)
 from sonar_graph.models import wrap_angle
 from sonar_graph.navigation.alignment import Estimate1D, Estimates3D
 from sonar_graph.numerics import chi_square_quantile
@@ -90,6 +97,8 @@ LEAST_MOVED = 1.0
 STUCK_MOVED = 10.0
 """The same for a sensor that is stuck."""
 STEP_GAIN_ERROR = 0.1
+STEP_RATIO = 3.0
+"""Steps of a sensor over those of its motion, from which on they are none of the motion."""
 MOST_MISFIT = 0.3
 """Share of its changes that the reference does not explain, from which on a sensor contradicts it."""
 LARGEST_SCATTER = 10.0
@@ -130,7 +139,7 @@ class Check:
     """Of one row, in the sensor's unit."""
     sense: Callable[[Sequence, LogConfig], Advice]
     """Where the gain is negative or the signal is mirrored."""
-    scaled: Callable[[LogConfig, float], Advice]
+    scaled: Callable[[LogConfig, float], str]
     """Where the gain is near 1."""
     units: Mapping[str, float] = field(default_factory=dict)
     """Factors to the right unit, by the name of the wrong one."""
@@ -161,36 +170,19 @@ class Check:
         return self.role == "detections"
 
 
-@dataclass(frozen=True, eq=False)
-class ComparedRows:
-    """Rows of a sensor, and at the rows of the motion what they are compared with."""
-
-    seconds: Floats
-    """Shape (n,)."""
-    y: Values
-    """Shape (n,)."""
-    x: Values
-    """Shape (m,)."""
-    beside: Values | None = None
-    """What else may move the sensor, shape (m,)."""
-
-    def match(
-        self,
-        motion: BodyMotion,
-        drift_sigma: float = 0.0,
-        longest_s: float = STRETCH_S,
-    ) -> Match:
-        """The comparison, which keeps what was compared for the search of causes."""
-        x = motion.reference(self.x)
-        stretches = motion.stretches(self.seconds, self.y, x, longest_s)
-        found = match(stretches, drift_sigma)
-        if self.beside is not None:
-            beside = motion.reference(self.beside)
-            stretches = [
-                replace(part, beside=lambda t: beside(t)[:, None]) for part in stretches
-            ]
-        whole = motion.stretches(self.seconds, self.y, x, np.inf)
-        return replace(found, stretches=tuple(stretches), whole=tuple(whole))
+def match_rows(
+    motion: BodyMotion,
+    seconds: Floats,
+    y: Values,
+    x: Values,
+    drift_sigma: float = 0.0,
+    longest_s: float = STRETCH_S,
+) -> Match:
+    """Rows of a sensor compared with what the motion has at its own rows; also in one piece, for the search of causes."""
+    reference = motion.reference(x)
+    found = match(motion.stretches(seconds, y, reference, longest_s), drift_sigma)
+    whole = motion.stretches(seconds, y, reference, np.inf)
+    return replace(found, whole=tuple(whole))
 
 
 def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -203,8 +195,12 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     # the noise of velocities adds up to a walk of the height, which grows with the time compared
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
-    rows = ComparedRows(t, depth.z_m, height, motion.ahead_m)
-    found = rows.match(motion, drift_sigma=0.03, longest_s=longest_s)
+    found = match_rows(motion, t, depth.z_m, height, 0.03, longest_s)
+    ahead = motion.reference(motion.ahead_m)
+    stretches = [
+        replace(part, beside=lambda t: ahead(t)[:, None]) for part in found.stretches
+    ]
+    found = replace(found, stretches=tuple(stretches))
     return found.less_certain(motion.sampling_error(motion.height_m))
 
 
@@ -226,7 +222,7 @@ def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
         return None
     t = motion.since_origin(heading.stamps_ns)
     yaw_rad = np.unwrap(heading.yaw_rad)
-    return ComparedRows(t, yaw_rad, motion.yaw_rad).match(motion, drift_sigma=0.02)
+    return match_rows(motion, t, yaw_rad, motion.yaw_rad, 0.02)
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -239,31 +235,35 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = ComparedRows(t, level, path).match(motion)
+    found = match_rows(motion, t, level, path)
     return found.less_certain(motion.sampling_error(motion.path_m))
 
 
 def is_level_fix(fixes: PositionFixes) -> NDArray[np.bool_]:
     """Mask of fixes whose level coordinates are measured, shape (n,)."""
-    variances = np.einsum("nii->ni", fixes.covariance_m2)[:, :2]
-    is_unmeasured = (variances >= 0.5 * UNMEASURED_M2).any(axis=1)
-    return np.asarray(fixes.are_sound() & ~is_unmeasured)
+    return np.asarray(fixes.are_sound() & ~are_unmeasured(fixes)[:, :2].any(axis=1))
+
+
+def are_unmeasured(fixes: PositionFixes) -> NDArray[np.bool_]:
+    """Mask of coordinates that a fix states as not measured, shape (n, 3)."""
+    variances = np.einsum("nii->ni", fixes.covariance_m2)
+    return np.asarray(variances >= 0.5 * UNMEASURED_M2)
 
 
 def sighting_match(
     sequence: Sequence, motion: BodyMotion, *, of_range: bool
 ) -> Match | None:
     """Changes between sightings of a landmark by the motion, with azimuths as they are or mirrored."""
-    signs = {}
+    fits = list[tuple[SightingChanges, Match]]()
     for sign in (1.0, -1.0):
         changes = sighting_changes(sequence, motion, sign)
         if changes is None:
             return None
         # only turns show a delay: ranges change evenly
-        signs[sign] = (changes, match([changes.azimuth], find_lag=not of_range))
+        fits.append((changes, match([changes.azimuth], find_lag=not of_range)))
     # a landmark's place depends on its azimuth: a mirrored one is more than a gain of -1
-    is_mirrored = signs[-1.0][1].scatter < signs[1.0][1].scatter / CLEARLY_BETTER
-    changes, by_azimuth = signs[-1.0 if is_mirrored else 1.0]
+    is_mirrored = fits[1][1].scatter < fits[0][1].scatter / CLEARLY_BETTER
+    changes, by_azimuth = fits[is_mirrored]
     if of_range:
         aperture_rad = sequence.calibration.sonar.elevation_aperture_rad
         return range_match(changes, aperture_rad)
@@ -300,9 +300,8 @@ DEPTH = Check(
     step_unit="m",
     units=LENGTHS | PRESSURES,
     sense=lambda sequence, config: depth_sense(sequence, config),
-    scaled=lambda config, gain: Advice(
-        "",
-        f"{scale_line('depth', 'scale', config, gain)}; of a pressure the water's density (water_density_kg_m3)",
+    scaled=lambda config, gain: (
+        f"{scale_line('depth', 'scale', config, gain)}; of a pressure the water's density (water_density_kg_m3)"
     ),
 )
 HEADING = Check(
@@ -317,9 +316,9 @@ HEADING = Check(
         "it turns against the gyros, clockwise", other_world(config, "heading")
     ),
     # a heading that turns too far is right as a rule: the gyros' rate is too small
-    scaled=lambda config, gain: Advice(
-        "the gyros' scale is wrong, or the compass deviates with the heading",
-        scale_line("imu", "angular_velocity_scale", config, 1.0 / gain),
+    scaled=lambda config, gain: (
+        "the gyros' scale is wrong, or the compass deviates with the heading: "
+        + scale_line("imu", "angular_velocity_scale", config, 1.0 / gain)
     ),
     least_scale=0.01,
     # gyros keep within one per cent, and each turn adds to the error
@@ -342,10 +341,9 @@ POSITIONS = Check(
         f"{other_world(config, 'positions')}, or the fields of position in another order; of latitude and longitude, one "
         "without its sign",
     ),
-    scaled=lambda config, gain: Advice(
-        "",
+    scaled=lambda config, gain: (
         f"{scale_line('positions', 'scale', config, gain)}; or the Doppler log's scale is wrong: "
-        f"`scale = {config.number('dvl', 'scale', 1.0) * gain:.4g}` under [dvl]",
+        f"`scale = {config.number('dvl', 'scale', 1.0) * gain:.4g}` under [dvl]"
     ),
     least_lag_s=0.3,
     other_lines={
@@ -366,16 +364,15 @@ RANGE = SIGHTINGS(
     other_lines={KNOTS: KNOTS_LINE},
     scale_key="range_scale",
     # landmarks are wrong by the error of the whole range, not of its changes
-    reach=lambda sequence, _: typical_sighting(sequence)[0],
+    reach=lambda sequence, _: typical_sighting(sequence, "range_m"),
     causes=(OF_RANGES, SONAR_TURN),
     sense=lambda *_: Advice(
         "they grow where the vehicle approaches: the sonar looks backwards, or the Doppler log has the wrong sense?",
         f"`sonar.mounting.rpy_rad` {IN_CALIBRATION}, its yaw changed by 3.1416",
     ),
-    scaled=lambda config, gain: Advice(
-        "",
+    scaled=lambda config, gain: (
         f"{scale_line('detections', 'range_scale', config, gain)}: the sonar's speed of sound is wrong, or the scale "
-        "of the Doppler log",
+        "of the Doppler log"
     ),
 )
 AZIMUTH = SIGHTINGS(
@@ -384,14 +381,12 @@ AZIMUTH = SIGHTINGS(
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units=DEGREES,
     scale_key="azimuth_scale",
-    reach=lambda sequence, _: typical_sighting(sequence)[1],
+    reach=lambda sequence, _: typical_sighting(sequence, "azimuth_rad"),
     sense=lambda _, config: Advice(
         "they turn with the vehicle, mirrored",
         f'{scale_line("detections", "azimuth_scale", config, -1.0)}; of a Detection3DArray `rotation = "frd"`',
     ),
-    scaled=lambda config, gain: Advice(
-        "", scale_line("detections", "azimuth_scale", config, gain)
-    ),
+    scaled=partial(scale_line, "detections", "azimuth_scale"),
     systematic=0.01,
     least_scale=0.1,
     is_angle=True,
@@ -415,24 +410,15 @@ def depth_sense(sequence: Sequence, config: LogConfig) -> Advice:
 def begins_below_water(sequence: Sequence) -> bool:
     """True for depths that begin at a stated start, which is not where z has no sign: they are right."""
     start = sequence.calibration.start
-    is_deep = abs(start.position_m[2]) > HIGHEST_M
-    return (
-        start.states("position_m")
-        and is_deep
-        and not any(start_depth_findings(sequence))
-    )
+    is_deep = start.states("position_m") and abs(start.position_m[2]) > HIGHEST_M
+    return is_deep and not any(start_depth_findings(sequence))
 
 
-def typical_sighting(sequence: Sequence) -> tuple[float, float]:
-    """Range, m, and size of the azimuth, rad, of sightings that can be used, root mean squares; 0 without any."""
+def typical_sighting(sequence: Sequence, column: str) -> float:
+    """Size of the range, m, or of the azimuth, rad, of sightings that can be used, a root mean square."""
     seen = sequence.detections
-    if seen is None or not (is_sound := seen.are_sound()).any():
-        return 0.0, 0.0
-    mean_squares = [
-        float(np.mean(np.square(values[is_sound])))
-        for values in (seen.range_m, seen.azimuth_rad)
-    ]
-    return float(np.sqrt(mean_squares[0])), float(np.sqrt(mean_squares[1]))
+    assert seen is not None
+    return root_mean_square([getattr(seen, column)[seen.are_sound()]])
 
 
 def fix_sigma_m(sequence: Sequence) -> tuple[float, float, float]:
@@ -440,9 +426,10 @@ def fix_sigma_m(sequence: Sequence) -> tuple[float, float, float]:
     known = sequence.positions
     if known is not None:
         variances = np.einsum("nii->ni", known.covariance_m2)
-        variances = variances[known.are_sound() & np.isfinite(variances).all(axis=1)]
         # a coordinate that is not measured says nothing of those that are
-        measured = np.where(variances < 0.5 * UNMEASURED_M2, variances, np.nan)
+        measured = np.where(are_unmeasured(known), np.nan, variances)
+        stated = known.are_sound() & np.isfinite(variances).all(axis=1)
+        measured = measured[stated]
         if np.isfinite(measured).any(axis=0).all():
             x, y, z = np.sqrt(np.nanmedian(measured, axis=0)).tolist()
             return x, y, z
@@ -461,9 +448,8 @@ def findings_of(
     quantity = check.quantity or f"{check.name}: change over that by {check.against}"
     if not found.gain.is_known:
         return [Finding(quantity, found.gain)]
-    still = "too little turning"
-    if not check.is_angle:
-        still = f"too little motion for {check.name}"
+    little = "turning" if check.is_angle else f"motion for {check.name}"
+    still = f"too little {little}"
     sigma = check.sigma(sequence)
     size = max(1.0, abs(found.gain.value))
     by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
@@ -629,24 +615,22 @@ class SensorComparison:
             return [Finding(self.quantity, unknown(reason))]
         row = Finding(self.quantity, gain, cause=NO_NEED)
         if is_off and error > self.sigma and not self.slips:
-            advice = self.check.scaled(self.config, size)
+            is_grave = abs(off.value) > self.check.grave_scale
             row = replace(
                 row,
                 cause=f"it changes {size:.3g} times as much",
                 consequence=f"up to {error:.2g}",
-                line=f"{advice.cause}: {advice.line}" if advice.cause else advice.line,
-                gravity=Gravity.GRAVE
-                if abs(off.value) > self.check.grave_scale
-                else self.gravity(error),
+                line=self.check.scaled(self.config, size),
+                gravity=gravity_of(is_grave or self.is_grave(error)),
             )
         # wheels start to slip in turns: no delay of a sensor
         if not self.found.lag.is_known or self.slips:
             return [row]
         return [row, self.delay()]
 
-    def gravity(self, error: float) -> Gravity:
-        """Class of a finding by the error that it makes."""
-        return Gravity.GRAVE if error > GRAVE_ERROR * self.sigma else Gravity.ACT
+    def is_grave(self, error: float) -> bool:
+        """True where an error makes results doubtful."""
+        return error > GRAVE_ERROR * self.sigma
 
     def delay(self) -> Finding:
         """Row for a delay of the sensor."""
@@ -666,7 +650,7 @@ class SensorComparison:
             cause=f"its rows come too {late}{of_imu}",
             consequence=f"an error of {error:.2g} typically",
             line=shift_line(check.role, self.config, -lag.value),
-            gravity=self.gravity(error),
+            gravity=gravity_of(self.is_grave(error)),
         )
 
 
@@ -726,42 +710,35 @@ def vertical_bias(
     up = np.median(motion.up, axis=0)
     up = up / np.linalg.norm(up)
     turned_rad = abs(bias.value) * sequence.duration_s
-    level_rad_s = np.zeros(3)
-    if of_axes is not None:
-        known = np.array([one.value if one.is_known else 0.0 for one in of_axes])
-        level_rad_s = known - (known @ up) * up
-        # the truth drifts from nothing
-        is_known = sequence.heading is not None and all(one.is_known for one in of_axes)
-        sigma = float(np.linalg.norm([one.sigma for one in of_axes] * up))
-        apart = bias.minus(float(known @ up))
-        if is_known and matters(apart, LEAST_BIAS_RAD_S, sigma):
-            return heading_drift(replace(apart, value=-apart.value), turned_rad)
+    axes = of_axes or (unknown("not compared"),) * 3
+    known = known_values(axes)
     # the line is in the axes of the IMU
     body_R_imu = imu.mounting.pose().rotation().matrix()
-    more_rad_s = (level_rad_s + bias.value * up) @ body_R_imu
-    whole = np.add(imu.gyro_bias_rad_s, more_rad_s)
-    return Finding(
+    more_rad_s = known - (known @ up) * up + bias.value * up
+    whole = np.add(imu.gyro_bias_rad_s, more_rad_s @ body_R_imu)
+    row = Finding(
         VERTICAL_BIAS,
         bias,
         "rad/s",
         cause=f"by {source}, {np.degrees(bias.value):.3g}°/s beyond the calibration's sigma of {allowed:.2g}",
         consequence=f"a turn of {np.degrees(turned_rad):.3g}° over the log",
         line=f"`imu.gyro_bias_rad_s = {numbers(whole, 5)}` {IN_CALIBRATION}",
-        gravity=Gravity.GRAVE if turned_rad > LARGE_TURN_RAD else Gravity.ACT,
+        gravity=gravity_of(turned_rad > LARGE_TURN_RAD),
     )
-
-
-def heading_drift(drift: Estimate1D, turned_rad: float) -> Finding:
-    """A heading that drifts against gyros whose bias Doppler log and accelerometers show."""
-    return Finding(
-        f"{HEADING.name}: drift",
-        drift,
-        "rad/s",
+    # the truth drifts from nothing
+    if sequence.heading is None or not all(one.is_known for one in axes):
+        return row
+    sigma = float(np.linalg.norm([one.sigma for one in axes] * up))
+    apart = bias.minus(float(known @ up))
+    if not matters(apart, LEAST_BIAS_RAD_S, sigma):
+        return row
+    return replace(
+        row,
+        quantity=f"{HEADING.name}: drift",
+        estimate=replace(apart, value=-apart.value),
         cause="it turns otherwise than the gyros, whose bias forces and velocities show: a compass that drifts, or is "
         "disturbed",
-        consequence=f"a turn of {np.degrees(turned_rad):.3g}° over the log",
         line=unused(HEADING.role),
-        gravity=Gravity.GRAVE if turned_rad > LARGE_TURN_RAD else Gravity.ACT,
     )
 
 
@@ -777,20 +754,27 @@ ATMOSPHERE_M = 10.1
 ATMOSPHERE_SHARE = 0.05
 
 
+def first_rows(stamps_ns: Ints, start_ns: int) -> slice:
+    """Rows of a sensor at the start."""
+    first = max(int(np.searchsorted(stamps_ns, start_ns)) - 1, 0)
+    return slice(first, first + FIRST_ROWS)
+
+
 def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     """Depths at another height than the position fixes: the fixes are wrong where the depths begin at a stated start."""
     depth = sequence.depth
     fixes = sequence.positions
     if depth is None or fixes is None:
         return
-    heights_m2 = fixes.covariance_m2[:, 2, 2]
-    inside = fixes.are_sound() & ~(heights_m2 >= 0.5 * UNMEASURED_M2)
-    inside &= fixes.stamps_ns >= depth.stamps_ns[0]
-    inside &= fixes.stamps_ns <= depth.stamps_ns[-1]
-    if np.count_nonzero(inside) < NEAR_START:
+    has_height = fixes.are_sound() & ~are_unmeasured(fixes)[:, 2]
+    fixes = fixes.rows(np.flatnonzero(has_height))
+    by_depth = np.interp(
+        fixes.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan
+    )
+    off = fixes.position_m[:, 2] - by_depth
+    off = off[np.isfinite(off)]
+    if len(off) < NEAR_START:
         return
-    by_depth = np.interp(fixes.stamps_ns[inside], depth.stamps_ns, depth.z_m)
-    off = fixes.position_m[inside, 2] - by_depth
     off_m = float(np.median(off))
     sigma_m = max(fix_sigma_m(sequence)[2], float(np.median(np.abs(off - off_m))))
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
@@ -804,13 +788,8 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
         line = origin_line(config, (0.0, 0.0, off_m), 2)
         if "log.origin" in sequence.notes:
             line = f"an `origin_deg_m` that is {off_m:+.2f} m higher, in geodetic under [positions] {IN_LOG_CONFIG}"
-    yield contradiction(
-        "depth: height of the position fixes over it",
-        cause,
-        line,
-        Estimate1D(off_m, sigma_m),
-        "m",
-    )
+    quantity = "depth: height of the position fixes over it"
+    yield contradiction(quantity, cause, line, Estimate1D(off_m, sigma_m), "m")
 
 
 def origin_line(config: LogConfig, off_m: ArrayLike, digits: int) -> str:
@@ -825,19 +804,17 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     if depth is None:
         return
     start = sequence.calibration.start
-    first = max(int(np.searchsorted(depth.stamps_ns, sequence.start_ns)) - 1, 0)
-    rows_m = depth.z_m[first : first + FIRST_ROWS]
+    rows_m = depth.z_m[first_rows(depth.stamps_ns, sequence.start_ns)]
     height_m = float(np.median(rows_m))
     if not start.states("position_m"):
         # a map has heights of its own
         if height_m > HIGHEST_M and sequence.calibration.map is None:
             yield above_water(height_m, sequence.calibration.depth.sigma_m)
         return
-    port = np.array(sequence.calibration.depth.port_m)
+    sensor = sequence.calibration.depth
+    port = np.array(sensor.port_m)
     off_m = height_m - float(start.pose().transformFrom(port)[2])
-    sigma_m = float(
-        np.hypot(start.position_sigma_m[2], sequence.calibration.depth.sigma_m)
-    )
+    sigma_m = float(np.hypot(start.position_sigma_m[2], sensor.sigma_m))
     climbed_m = float(np.ptp(rows_m))
     if abs(off_m) <= FARTHEST_FROM_START_M + climbed_m + ACTING_SIGMAS * sigma_m:
         return
@@ -854,7 +831,7 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
         "altimeter, another sign, unit or origin, or a wrong start?",
         line=f"{of_air}{unused('depth')} leaves the depths out, scale = -1 there is for depths downwards; "
         f"`start.position_m = {numbers((x, y, z + off_m), 2)}` {IN_CALIBRATION} where the depths are right",
-        estimate=Estimate1D(off_m, sequence.calibration.depth.sigma_m),
+        estimate=Estimate1D(off_m, sensor.sigma_m),
         unit="m",
     )
 
@@ -901,18 +878,15 @@ def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Find
     start = right.calibration.start
     if heading is None or not start.states("rpy_rad"):
         return
-    first = max(int(np.searchsorted(heading.stamps_ns, right.start_ns)) - 1, 0)
-    t = motion.since_origin(heading.stamps_ns[first : first + FIRST_ROWS])
+    rows = first_rows(heading.stamps_ns, right.start_ns)
+    t = motion.since_origin(heading.stamps_ns[rows])
     turned = motion.reference(motion.yaw_rad)(t) - motion.yaw_rad[0]
-    off = heading.yaw_rad[first : first + FIRST_ROWS] - turned - start.rpy_rad[2]
-    if not np.isfinite(off).any():
-        return
+    off = wrap_angle(heading.yaw_rad[rows] - turned - start.rpy_rad[2])
+    off = off[np.isfinite(off)]
     calibration = right.calibration.heading
     sigma = np.hypot(calibration.sigma_rad, calibration.bias_sigma_rad)
-    error = Estimate1D(
-        float(np.nanmedian(wrap_angle(off))),
-        float(np.hypot(sigma, start.rpy_sigma_rad[2])),
-    )
+    sigma = float(np.hypot(sigma, start.rpy_sigma_rad[2]))
+    error = Estimate1D(float(np.median(off)) if len(off) else 0.0, sigma)
     if not matters(error, LARGE_TURN_RAD):
         return
     yield contradiction(
@@ -945,13 +919,13 @@ def heading_turn(
     # on a way without turns the sense shows only here
     clockwise_rad = np.pi / 2 - right.heading.yaw_rad
     other = course_angle(known, clockwise_rad, right, motion)
-    is_clockwise = other.is_known and not matters(other, 0.0, allowed)
-    sense = "clockwise from north, or " if is_clockwise else ""
-    of_sense = f"{other_world(config, 'heading')}; or " if is_clockwise else ""
+    sense = of_sense = ""
+    if other.is_known and not matters(other, 0.0, allowed):
+        sense = "clockwise from north, or "
+        of_sense = f"{other_world(config, 'heading')}; or "
     offset = config.number("heading", "yaw_offset_rad", 0.0) + angle.value
-    rpy = numbers(
-        turned_mounting(right.calibration.dvl.mounting, (0.0, 0.0, angle.value)), 4
-    )
+    turn_rad = (0.0, 0.0, angle.value)
+    rpy = turned_mounting(right.calibration.dvl.mounting, turn_rad)
     vertical = vertical_bias(right, motion)
     is_biased = vertical is not None and vertical.acts
     first = "once the gyro bias is put right, which comes first, " if is_biased else ""
@@ -961,8 +935,8 @@ def heading_turn(
         row,
         cause=f"{first}{sense}either its world, north or mounting is another",
         line=f"{of_sense}`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}{OR_DVL} is turned on the "
-        f"vehicle: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}",
-        gravity=Gravity.GRAVE if abs(angle.value) > large_rad else Gravity.ACT,
+        f"vehicle: `dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
+        gravity=gravity_of(abs(angle.value) > large_rad),
     )
 
 
@@ -985,9 +959,9 @@ def course_angle(
     reason = "too little motion beside positions"
     # north and east exchanged are a fault of the positions; a way that fits badly has no direction
     is_way = not turn.is_mirrored and turn.misfit < MOST_MISFIT
-    if is_way and 0.5 < turn.gain.value < 2.0:
-        return turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, reason)
-    return unknown(reason)
+    if not (is_way and 0.5 < turn.gain.value < 2.0):
+        return unknown(reason)
+    return turn.angle.limited(LARGEST_HEADING_SIGMA_RAD, reason)
 
 
 HIGH_PERCENTILE = 95.0
@@ -1058,11 +1032,8 @@ def position_findings(
     share, count = jumping_share(right, fixes)
     # of another scale, fixes move farther than the vehicle too
     is_scaled = rows[0].acts and not rows[0].grave
-    if (
-        not is_scaled
-        and share > LARGEST_JUMPING_SHARE
-        and share * count >= FEWEST_JUMPS
-    ):
+    is_often = share > LARGEST_JUMPING_SHARE and share * count >= FEWEST_JUMPS
+    if is_often and not is_scaled:
         sigma = float(np.sqrt(share * (1 - share) / count))
         yield contradiction(
             "position fixes: jumps",
@@ -1106,16 +1077,14 @@ def led_to_fixes(
     if np.count_nonzero(inside) < NEAR_START:
         return None
     x, y, _ = start.position_m
-    placed = fixes.position_m[inside] @ [1.0, 1j, 0.0] - (x + 1j * y)
-    off = placed - moved[inside]
+    moved = moved[inside]
+    off = fixes.position_m[inside] @ [1.0, 1j, 0.0] - (x + 1j * y) - moved
     median_off = np.array([np.median(off.real), np.median(off.imag), 0.0])
-    way = float(np.median(np.abs(moved[inside])))
-    antenna_m = float(np.hypot(*right.calibration.positions.antenna_m[:2]))
     parts = (
         level_sigma_m(fix_sigma_m(right)) / 2,
         level_sigma_m(start.position_sigma_m),
-        way * start.rpy_sigma_rad[2],
-        antenna_m,
+        float(np.median(np.abs(moved))) * start.rpy_sigma_rad[2],
+        float(np.hypot(*right.calibration.positions.antenna_m[:2])),
     )
     return median_off, float(np.linalg.norm(parts))
 
@@ -1127,26 +1096,23 @@ def distance_finding(
 
     From a start with a stated heading the path leads to the fixes of a minute; else the way to the first ones is allowed.
     """
-    calibration = right.calibration
-    start = calibration.start
+    start = right.calibration.start
     noise_m = level_sigma_m(fix_sigma_m(right))
     start_m = level_sigma_m(start.position_sigma_m)
     order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
     near = np.median(fixes.position_m[order], axis=0)
     off = near - start.position_m
-    # how far the vehicle can be from the start by then
-    path_m = float(way_m(right, fixes.stamps_ns[order]).max())
     from_origin_m = float(np.hypot(*near[:2]))
     sigma_m = float(np.hypot(noise_m, start_m))
-    allowed_m = 5.0 * sigma_m + path_m
-    led = led_to_fixes(right, fixes, motion)
-    if led is not None:
+    # how far the vehicle can be from the start by then
+    reach_m = float(way_m(right, fixes.stamps_ns[order]).max())
+    if led := led_to_fixes(right, fixes, motion):
         off, sigma_m = led
-        allowed_m = 5.0 * sigma_m + FARTHEST_FROM_START_M
+        reach_m = FARTHEST_FROM_START_M
     from_start_m = float(np.hypot(*off[:2]))
     quantity = "position fixes: distance from the start"
     row = Finding(quantity, Estimate1D(from_start_m, sigma_m), "m", NO_NEED)
-    if from_start_m > allowed_m:
+    if from_start_m > 5.0 * sigma_m + reach_m:
         place = f"{from_start_m:.3g} m from the start"
         more = "moves them to the start; or state another start"
     elif from_origin_m > FARTHEST_ORIGIN_M:

@@ -11,7 +11,8 @@ Doppler log measures, so that the two differ where the vehicle turns and moves.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import permutations, product
 
 import numpy as np
@@ -54,11 +55,11 @@ SMALL_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class AxesMatch:
-    """The candidates that fit best."""
+    """The candidates that fit best; by default nothing need be changed."""
 
-    gyro: Floats
+    gyro: Floats = field(default_factory=partial(np.eye, 3))
     """G, shape (3, 3): the body's rate is G times the one as read."""
-    dvl: Floats
+    dvl: Floats = field(default_factory=partial(np.eye, 3))
     """P, shape (3, 3): the body's velocity is P times the one as read."""
     ratio: float = 1.0
     """Typical misfit as read over that of the candidates."""
@@ -68,11 +69,6 @@ class AxesMatch:
     """The body's velocity is so many times the one as read; 1 where that is no other unit."""
     is_mixed: bool = False
     """True where a matrix fits that is no rotation."""
-
-    @classmethod
-    def as_read(cls) -> "AxesMatch":
-        """Nothing need be changed."""
-        return cls(np.eye(3), np.eye(3))
 
 
 def signed_permutations() -> Floats:
@@ -103,14 +99,13 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
         with_force_axes(rows, candidates, squares, least)
     best = squares.min()
     variance = best / rows.freedom
-    is_better = squares[0, 0] - best > LEAST_GAIN * variance
-    is_clear = squares[0, 0] > LEAST_RATIO * best
+    as_read = squares[0, 0]
+    is_better = as_read - best > LEAST_GAIN * variance
     least_left = least.flat[squares.argmin()]
     # what any matrix explains, and how much of it the best candidate does not
-    explained = squares[0, 0] - least_left
     is_fit = best <= MOST_LEFT * least_left
-    is_fit |= best - least_left <= SMALL_SHARE * explained
-    if not (is_better and is_clear and is_fit):
+    is_fit |= best - least_left <= SMALL_SHARE * (as_read - least_left)
+    if not (is_better and as_read > LEAST_RATIO * best and is_fit):
         right_handed = candidates[handed > 0]
         return other_matrix(rows, right_handed[squares[0, handed > 0].argmin()])
     # of candidates that fit as well the one that changes least
@@ -118,15 +113,13 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     close = np.argwhere(squares - best < LEAST_GAIN / 4 * variance).tolist()
 
     def preference(pair: list[int]) -> tuple[float, float, float]:
-        k, j = pair
-        kept = changes_least[k] + changes_least[j]
-        return kept, handed[k] + handed[j], -squares[k, j]
+        kept = changes_least[pair].sum()
+        return kept, handed[pair].sum(), -squares[tuple(pair)]
 
     g, p = max(close, key=preference)
     other = np.diag([1.0, 1.0, -1.0]) @ candidates[p]
-    rivals = [candidates[j] for k, j in close if k == g]
-    is_sure = not any((rival == other).all() for rival in rivals)
-    ratio = float(np.sqrt(squares[0, 0] / squares[g, p]))
+    is_sure = not any(k == g and (candidates[j] == other).all() for k, j in close)
+    ratio = float(np.sqrt(as_read / squares[g, p]))
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
@@ -159,14 +152,14 @@ def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
     leaves little, mixes axes, as velocities along beams are mixed.
     """
     if rows.freedom < LEAST_FREEDOM:
-        return AxesMatch.as_read()
+        return AxesMatch()
     Q = rows.quadratic_form(np.eye(3))
     least = least_of(Q)
     as_read = square_of(Q, np.eye(3))
     most = MOST_LEFT * least
     # late rows fit badly in any axes
     if as_read < OTHER_MATRIX * least or least > MOST_MISFIT * Q[0, 0]:
-        return AxesMatch.as_read()
+        return AxesMatch()
     ratio = float(np.sqrt(as_read / least))
     identity = np.eye(3).ravel()
     scale = -float(Q[0, 1:] @ identity) / float(identity @ Q[1:, 1:] @ identity)
@@ -179,17 +172,16 @@ def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
             # level motion hardly shows the sense along z: then a turn
             senses = (np.diag([-1.0, -1.0, 1.0]), -np.eye(3))
             P = min(senses, key=lambda P: square_of(Q, -scale * P))
-            return AxesMatch(np.eye(3), P, ratio)
+            return AxesMatch(dvl=P, ratio=ratio)
         is_other = not 1 / OTHER_UNIT < scale < OTHER_UNIT
         is_unit = scale > 0 and is_other and is_of_dvl
-        return AxesMatch(np.eye(3), np.eye(3), ratio, scale=scale if is_unit else 1.0)
+        return AxesMatch(ratio=ratio, scale=scale if is_unit else 1.0)
     R = turned(Q, near)
     left = square_of(Q, R)
     # level motion hardly shows a tilt, and a turn about the vertical is that of the fit of mountings
     if left < most and R[2, 2] < 0:
-        return AxesMatch(np.eye(3), R, ratio)
-    is_mixed = left > OTHER_MATRIX * least
-    return AxesMatch(np.eye(3), np.eye(3), ratio, is_mixed=is_mixed)
+        return AxesMatch(dvl=R, ratio=ratio)
+    return AxesMatch(ratio=ratio, is_mixed=left > OTHER_MATRIX * least)
 
 
 def turned(Q: Floats, near: Floats) -> Floats:
@@ -222,9 +214,8 @@ def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float 
         return None
     of_body = least_of(rows.quadratic_form(np.eye(3)))
     of_world = least_of(rows.quadratic_form(np.eye(3), is_in_world=True))
-    variance = of_world / rows.freedom
-    is_clear = of_body > LEAST_RATIO * of_world
-    if is_clear and of_body - of_world > LEAST_GAIN * variance:
+    gain = (of_body - of_world) * rows.freedom / of_world
+    if of_body > LEAST_RATIO * of_world and gain > LEAST_GAIN:
         return float(np.sqrt(of_body / of_world))
     return None
 

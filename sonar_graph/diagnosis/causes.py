@@ -25,8 +25,8 @@ from sonar_graph.diagnosis.findings import (
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion, holes_beside
 from sonar_graph.diagnosis.signals import (
-    Explained,
     Match,
+    SignalStep,
     SignalStretch,
     Values,
     explained,
@@ -99,8 +99,7 @@ def of_turn_and_twice(stretch: SignalStretch) -> Values:
 
 def of_current(stretch: SignalStretch) -> Values:
     """Time, and the path itself, whose turn and scale are other findings, shape (n, 2)."""
-    x = stretch.shifted(np.zeros(1))[0]
-    return np.column_stack([since_middle(stretch), x])
+    return np.column_stack([since_middle(stretch), stretch.x])
 
 
 def of_current_beside_scale(stretch: SignalStretch) -> Values:
@@ -108,14 +107,12 @@ def of_current_beside_scale(stretch: SignalStretch) -> Values:
 
     On a straight way a current along it and a scale are the same.
     """
-    x = stretch.shifted(np.zeros(1))[0]
-    return np.column_stack([of_way(stretch), x])
+    return np.column_stack([of_way(stretch), stretch.x])
 
 
 def of_scale(stretch: SignalStretch) -> Values:
     """Changes of ranges themselves, and what heights of landmarks take off them, shape (n, 2)."""
-    x = stretch.shifted(np.zeros(1))[0]
-    return np.column_stack([x, of_way(stretch)[:, 2]])
+    return np.column_stack([stretch.x, of_way(stretch)[:, 2]])
 
 
 def of_sonar_turn(stretch: SignalStretch) -> Values:
@@ -123,8 +120,7 @@ def of_sonar_turn(stretch: SignalStretch) -> Values:
 
     Turned by an angle a, ranges change by ``cos(a) x + sin(a) x_left``.
     """
-    x = stretch.shifted(np.zeros(1))[0]
-    return np.column_stack([of_way(stretch)[:, 3], x])
+    return np.column_stack([of_way(stretch)[:, 3], stretch.x])
 
 
 def drift_advice(q: Values, _: Calibration) -> Advice:
@@ -259,11 +255,11 @@ def cause_of(
 
     ``most``: largest ratio of the scatter to that of the best gain and delay.
     """
-    fits = list[tuple[Explained, Cause]]()
-    for cause in causes:
-        result = explained(found.stretches, cause.columns, cause.wanted)
-        if result is not None and result.is_clear:
-            fits.append((result, cause))
+    tried = (
+        (explained(found.stretches, cause.columns, cause.wanted), cause)
+        for cause in causes
+    )
+    fits = [(result, cause) for result, cause in tried if result and result.is_clear]
     if not fits:
         return None
     result, cause = min(fits, key=lambda fit: fit[0].after)
@@ -291,7 +287,7 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
     """Size and times of steps of a sensor beyond its reference; empty without any."""
     texts = list[str]()
     for whole in found.whole:
-        x = turned_to(whole.y, whole.shifted(np.zeros(1))[0])
+        x = turned_to(whole.y, whole.x)
         for step in steps(whole.seconds, whole.y, x, sigma, ratio):
             size = np.degrees(step.size) if unit == "°" else step.size
             texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
@@ -335,10 +331,8 @@ def excursion(found: Match, least: float) -> str:
         scatter = 1.4826 * float(np.median(np.abs(off)))
         is_off = np.abs(off) > max(least, EXCURSION_SCATTERS * scatter)
         if is_off.any() and is_off.mean() <= MOST_OFF:
-            rows = np.flatnonzero(is_off)
             largest_deg = np.degrees(off[np.abs(off).argmax()])
-            begin_s = middle_s[rows[0]]
-            end_s = middle_s[rows[-1]]
+            begin_s, end_s = middle_s[np.flatnonzero(is_off)[[0, -1]]]
             return (
                 f"by up to {largest_deg:.2g}° between {begin_s:.0f} and {end_s:.0f} s"
             )
@@ -352,7 +346,7 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
         return None
     felt = motion.felt
     gravity = felt.gravity_m_s2 - residual(motion, felt.gravity_m_s2)  # (n, 3)
-    texts = list[str]()
+    found = list[SignalStep]()
     # nothing is felt in holes of the accelerometers
     imu = sequence.imu
     is_felt = np.isfinite(imu.specific_force).all(axis=1)
@@ -364,11 +358,10 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
         t = motion.seconds[rows]
         by_forces = felt.impulse_m_s[rows] - running_integral(t, gravity[rows])
         # a wrong unit of velocities was found before
-        found = steps(t, felt.velocity_m_s[rows], by_forces, BEST_NOISE_M_S, ratio=1.0)
-        for step in found:
-            texts.append(f"by {step.size:.2g} m/s at {step.seconds:.1f} s")
-    if not texts:
+        found += steps(t, felt.velocity_m_s[rows], by_forces, BEST_NOISE_M_S, ratio=1.0)
+    if not found:
         return None
+    texts = [f"by {step.size:.2g} m/s at {step.seconds:.1f} s" for step in found]
     return contradiction(
         "DVL: steps",
         estimate="wrong velocities",

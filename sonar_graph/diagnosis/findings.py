@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.measurements import Floats
 from sonar_graph.navigation.alignment import Estimate1D
 
 INTERVAL_SIGMAS = 1.96
@@ -106,6 +107,11 @@ class Finding:
         }
 
 
+def gravity_of(is_grave: bool) -> Gravity:
+    """Of a finding to act on."""
+    return Gravity.GRAVE if is_grave else Gravity.ACT
+
+
 def contradiction(
     quantity: str,
     cause: str,
@@ -136,13 +142,17 @@ def judged(
     """
     if not matters(error, least, allowed):
         return replace(row, cause=fits, consequence="", line="")
-    is_large = abs(error.value) > large
-    return replace(row, gravity=Gravity.GRAVE if is_large else Gravity.ACT)
+    return replace(row, gravity=gravity_of(abs(error.value) > large))
 
 
 def unknown(reason: str) -> Estimate1D:
     """A number that is not known."""
     return Estimate1D(np.nan, np.inf, reason)
+
+
+def known_values(estimates: Iterable[Estimate1D]) -> Floats:
+    """The numbers, with 0 for those that are not known."""
+    return np.array([one.value if one.is_known else 0.0 for one in estimates])
 
 
 def with_interval(estimate: Estimate1D, unit: str) -> str:

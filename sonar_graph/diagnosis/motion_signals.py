@@ -12,6 +12,7 @@ log: rows are numbered by the part without one that they belong to, and referenc
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -140,9 +141,8 @@ class BodyMotion:
             is_between = self.parts[after] != self.parts[after - 1]
             # the first row of a part belongs to it
             is_between &= self.seconds[after] != seconds
-            is_outside = (seconds < self.seconds[0]) | (seconds > self.seconds[-1])
-            found = np.interp(seconds, self.seconds, values)
-            return np.where(is_between | is_outside, np.nan, found)
+            found = np.interp(seconds, self.seconds, values, left=np.nan, right=np.nan)
+            return np.where(is_between, np.nan, found)
 
         return at
 
@@ -238,12 +238,10 @@ def felt_gravity(
     return np.asarray(gained / np.maximum(end - begin, 1e-9)[:, None] - accelerated)
 
 
-def part_edges(path: InertialPath, t: Floats, side: str) -> Floats:
+def part_edges(path: InertialPath, t: Floats, side: Literal["left", "right"]) -> Floats:
     """First (left) or last time of the part of the path that each instant is in, shape (n,)."""
-    part = path.parts_at(t)
-    if side == "left":
-        return path.seconds[np.searchsorted(path.parts, part, side="left")]
-    return path.seconds[np.searchsorted(path.parts, part, side="right") - 1]
+    rows = np.searchsorted(path.parts, path.parts_at(t), side=side)
+    return path.seconds[rows - (side == "right")]
 
 
 def smoothed(t: Floats, values: Floats) -> Floats:

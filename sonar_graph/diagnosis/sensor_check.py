@@ -8,7 +8,6 @@ docs/theory/sensor_check.md.
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -57,6 +56,7 @@ from sonar_graph.diagnosis.findings import (
     contradiction,
     in_degrees,
     judged,
+    known_values,
     matters,
     notes_of,
     numbers,
@@ -81,10 +81,10 @@ from sonar_graph.diagnosis.start import (
     accel_bias_findings,
     acting_bias,
     bias_findings,
-    find_start_heading,
     find_start_tilt,
     lacks_gravity,
     lever_findings,
+    start_heading_finding,
     tilt_findings,
     turned_mounting,
     with_bias,
@@ -134,6 +134,8 @@ ANY_AXES = "axes of gyros, accelerometers or Doppler log"
 NO_AXES = "no axes of the vehicle"
 CONTRADICTED = "they contradict each other"
 START_TILT = ("start roll", "start pitch")
+DELAYS = (": delay", ": time offset")
+"""Ends of quantities of a sensor's stamps against those of another."""
 COMPARED = "log.compared"
 """Subject of the note that sensors were compared, or why not."""
 LONGEST_S = 600.0
@@ -228,7 +230,12 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
-    sequence = without_gravity(without_stuck(sequence))
+    sequence = without_stuck(sequence)
+    if lacks_gravity(sequence):
+        # as if its owner had stated so
+        update = {"use_gravity": False}
+        calibration = sequence.calibration.model_copy(update=update)
+        sequence = replace(sequence, calibration=calibration)
     if reason := spoilt_by(sequence):
         return [Finding("sensors with each other", unknown(reason))]
     if coarse := coarse_findings(sequence):
@@ -243,40 +250,41 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         axes.append(pair.finding(YAW, in_degrees(match.turn[2]), TURNED))
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    # no other comparison is worth anything beside gyros that are wrong
-    if rates := rate_findings(sequence, config):
+    # gyros or velocities that are wrong by themselves are no reference for others
+    alone = (turn_rate_finding(sequence, config), velocity_steps(sequence))
+    if rates := [finding for finding in alone if finding is not None]:
         return [*forces, *axes, *rates]
     leaning, sequence = leaning_pair(match, sequence)
     if leaning:
         axes += leaning
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    tilting, unbiased = accel_bias_findings(match, sequence.calibration)
+    tilting, calibration = accel_bias_findings(match, sequence.calibration)
     axes += tilting
-    sequence = replace(sequence, calibration=unbiased)
-    is_turned = any(finding.quantity == YAW for finding in axes)
+    sequence = replace(sequence, calibration=calibration)
     x, y, z = (
         replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias
     )
-    match = replace(match, gyro_bias=(x, y, z))
-    if lacks_gravity(sequence):
-        match = replace(match, gyro_bias=(unknown(NO_GRAVITY),) * 3)
+    driven = (unknown(NO_GRAVITY),) * 3 if lacks_gravity(sequence) else (x, y, z)
     of_dvl = dvl_findings(match, sequence, config)
     # each following check sees the log as these lines would make it
     right = corrected_sequence(sequence, match, of_dvl)
     lever = lever_findings(match, sequence.calibration)
+    no_arm = ""
     if any(EITHER in finding.cause for finding in axes):
-        lever = [Finding(ARM, unknown("IMU or Doppler log is turned"), "m")]
+        no_arm = "IMU or Doppler log is turned"
     elif any(f.acts for f in of_dvl) and (names := brought_apart(sequence, right)):
         of_dvl = [contradicted(finding, names) for finding in of_dvl]
-        lever = [Finding(ARM, unknown("IMU and Doppler log do not fit"), "m")]
+        no_arm = "IMU and Doppler log do not fit"
         right = sequence
     tilt = find_start_tilt(right)
-    estimates, sources = surest_bias(match, tilt)
+    estimates, sources = surest_bias(driven, tilt)
+    up = UPRIGHT
     motion = BodyMotion.of(right)
-    up = UPRIGHT if motion is None else np.median(motion.up, axis=0)
-    of_heading = None if motion is None else vertical_bias(right, motion)
-    if of_heading is not None:
-        estimates = with_vertical(estimates, of_heading.estimate, up)
+    if motion is not None:
+        up = np.median(motion.up, axis=0)
+        of_heading = vertical_bias(right, motion)
+        if of_heading is not None:
+            estimates = with_vertical(estimates, of_heading.estimate, up)
     D_heading = up * right.duration_s  # (3,)
     bias = bias_findings(estimates, sources, right.calibration.imu, D_heading)
     right, estimates = without_acting_bias(right, estimates)
@@ -292,12 +300,11 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if any(f.acts for f in of_vertical):
         bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
     if any(f.acts and f.quantity.endswith(PITCH.name) for f in by_motion):
-        lever = [Finding(ARM, unknown("IMU or Doppler log is pitched"), "m")]
+        no_arm = "IMU or Doppler log is pitched"
     # gyros that are late against the forces look like an arm
     angles = (HEADING.name, AZIMUTH.name)
-    delays = [f for f in by_motion if f.quantity.endswith(": delay") and f.acts]
-    if any(f.quantity.startswith(angles) for f in delays):
-        lever = [Finding(ARM, unknown("gyros or other sensors are late"), "m")]
+    if any(f.quantity.startswith(angles) for f in acting_delays(by_motion)):
+        no_arm = "gyros or other sensors are late"
     reference = list(reference_findings(right, config, tilt))
     if right.calibration.start.states("rpy_rad"):
         off = tilt.angle(1).minus(right.calibration.start.rpy_rad[1])
@@ -305,35 +312,26 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         # a start by a pitched IMU is as wrong as its mounting
         if is_imu:
             reference = [f for f in reference if not f.quantity.startswith(START_TILT)]
-    noise = noise_findings(sequence)
     # sensors that are wrong do not fit a right map either
     is_sound = not any(finding.grave for finding in by_motion)
     of_map = list(map_findings(right)) if is_sound else []
     of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
-    of_stamps = [f for f in [of_dvl[0], *by_motion, *reference] if is_delay(f)]
-    if any(f.acts for f in [*of_stamps, *tilting]) and (
-        role := drifting_role(sequence)
-    ):
+    of_stamps = acting_delays([of_dvl[0], *by_motion, *reference])
+    if (of_stamps or tilting) and (role := drifting_role(sequence)):
         cause = f"stamps of [{role}] drift from the times of recording, or jump"
         line = f'`stamp = "log"` under [{role}] {IN_LOG_CONFIG}'
         of_dvl[0] = replace(of_dvl[0], cause=cause, line=line, gravity=Gravity.GRAVE)
-        lever = [Finding(ARM, unknown("the stamps drift"), "m")]
+        no_arm = "the stamps drift"
         # other sensors look late as well, and forces at other times are a bias
         axes = [f for f in axes if f not in tilting]
-        by_motion = [f for f in by_motion if not is_delay(f)]
-        reference = [f for f in reference if not (is_delay(f) and f.acts)]
-    of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts or not is_turned]
-    return [
-        *forces,
-        *axes,
-        *of_dvl,
-        *lever,
-        *bias,
-        *by_motion,
-        *reference,
-        *of_map,
-        *noise,
-    ]
+        by_motion = [f for f in by_motion if not f.quantity.endswith(DELAYS)]
+        reference = [f for f in reference if f not in of_stamps]
+    if any(f.quantity == YAW for f in axes):
+        of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts]
+    if no_arm:
+        lever = [Finding(ARM, unknown(no_arm), "m")]
+    of_motion = [*forces, *axes, *of_dvl, *lever, *bias, *by_motion]
+    return [*of_motion, *reference, *of_map, *noise_findings(sequence)]
 
 
 def unplaced_findings(sequence: Sequence, findings: list[Finding]) -> Iterator[Finding]:
@@ -362,27 +360,17 @@ def spoilt_by(sequence: Sequence) -> str:
     return gravity if OTHER_WAYS in gravity or FELT_ALONG in gravity else ""
 
 
-def is_delay(finding: Finding) -> bool:
-    """True for rows on the stamps of a sensor against those of another."""
-    return finding.quantity.endswith((": delay", ": time offset"))
+def acting_delays(findings: Iterable[Finding]) -> list[Finding]:
+    """Findings to act on about the stamps of a sensor against those of another."""
+    return [f for f in findings if f.acts and f.quantity.endswith(DELAYS)]
 
 
 def drifting_role(sequence: Sequence) -> str:
     """``dvl`` or ``imu``, whichever alone has stamps that drift from the times of recording; else empty."""
     faults = sequence.notes.get("log.stamps", "").split("; ")
-    is_drifting = {
-        role: any(DRIFTING in one and one.startswith(f"{role}:") for one in faults)
-        for role in ("dvl", "imu")
-    }
-    if is_drifting["dvl"] == is_drifting["imu"]:
-        return ""
-    return "dvl" if is_drifting["dvl"] else "imu"
-
-
-def rate_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
-    """Gyros or velocities that are wrong by themselves, so that they are no reference for others."""
-    found = (turn_rate_finding(sequence, config), velocity_steps(sequence))
-    return [finding for finding in found if finding is not None]
+    roles = {one.partition(":")[0] for one in faults if DRIFTING in one}
+    roles &= {"dvl", "imu"}
+    return roles.pop() if len(roles) == 1 else ""
 
 
 def by_late_imu(
@@ -390,23 +378,23 @@ def by_late_imu(
 ) -> tuple[list[Finding], list[Finding]]:
     """Findings of the Doppler log and of others, where all are early against a late IMU with one line for the IMU."""
     late, *others = of_dvl
-    delays = [f for f in by_motion if f.quantity.endswith(": delay") and f.acts]
+    offset = late.estimate
+    delays = acting_delays(by_motion)
     if not (late.acts and delays):
         return of_dvl, by_motion
     for delay in delays:
-        together = delay.estimate.minus(-late.estimate.value)
-        is_apart = matters(together, LEAST_TOGETHER_S, late.estimate.sigma)
+        together = delay.estimate.minus(-offset.value)
+        is_apart = matters(together, LEAST_TOGETHER_S, offset.sigma)
         # all but headings are compared with a path of the Doppler log, which is in time, along the late turns
-        is_between = (
-            LEAST_SHARE_OF_DELAY < -delay.estimate.value / late.estimate.value < 1.0
-        )
+        share = -delay.estimate.value / offset.value
+        is_between = LEAST_SHARE_OF_DELAY < share < 1.0
         if is_apart and (delay.quantity.startswith(HEADING.name) or not is_between):
             return of_dvl, by_motion
     names = " and ".join(delay.quantity.partition(" against")[0] for delay in delays)
     of_imu = replace(
         late,
         cause=f"{names} differ from the IMU by as much: the IMU's own stamps are wrong",
-        line=shift_line("imu", config, -late.estimate.value),
+        line=shift_line("imu", config, -offset.value),
     )
     return [of_imu, *others], [f for f in by_motion if f not in delays]
 
@@ -420,9 +408,8 @@ def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
     spare_ns = (last_ns - first_ns - round(LONGEST_S * NS_PER_S)) // 2
     if spare_ns <= 0:
         return imu, dvl
-    inner_imu = imu.between(first_ns + spare_ns, last_ns - spare_ns)
-    inner_dvl = dvl.between(first_ns + spare_ns, last_ns - spare_ns)
-    return inner_imu or imu, inner_dvl or dvl
+    inner = (first_ns + spare_ns, last_ns - spare_ns)
+    return imu.between(*inner) or imu, dvl.between(*inner) or dvl
 
 
 def without_stuck(sequence: Sequence) -> Sequence:
@@ -436,19 +423,7 @@ def without_stuck(sequence: Sequence) -> Sequence:
     of_dvl = np.flatnonzero(~stuck["velocity"])
     if len(of_imu) < 2 or len(of_dvl) < 2:
         return sequence
-    if len(of_imu) < len(imu):
-        imu = imu.rows(of_imu)
-    if len(of_dvl) < len(dvl):
-        dvl = dvl.rows(of_dvl)
-    return replace(sequence, imu=imu, dvl=dvl)
-
-
-def without_gravity(sequence: Sequence) -> Sequence:
-    """The sequence as if its owner had stated so, where gravity was taken out of the specific forces."""
-    if not lacks_gravity(sequence):
-        return sequence
-    calibration = sequence.calibration.model_copy(update={"use_gravity": False})
-    return replace(sequence, calibration=calibration)
+    return replace(sequence, imu=imu.rows(of_imu), dvl=dvl.rows(of_dvl))
 
 
 def force_findings(
@@ -456,13 +431,11 @@ def force_findings(
 ) -> tuple[list[Finding], Sequence]:
     """Scale of the accelerometers by gravity, and the sequence with the scale put right."""
     found = force_scale(sequence, config)
-    if found is None:
-        return [], sequence
-    if found.acts:
+    if found is not None and found.acts:
         imu = sequence.imu
         force = imu.specific_force / found.estimate.value
         sequence = replace(sequence, imu=replace(imu, specific_force=force))
-    return [found], sequence
+    return [found] if found else [], sequence
 
 
 def tried_axes(sequence: Sequence, config: LogConfig) -> tuple[list[Finding], Sequence]:
@@ -494,12 +467,10 @@ def axes_findings(
         cause = f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle"
         return [no_axes_finding(DVL_AXES, cause)], sequence
     found = match_axes(sequence.imu, sequence.dvl, calibration)
-    if found is None:
+    # steps of a velocity fit no axes, and have a finding of their own
+    if found is None or (found.is_mixed and velocity_steps(sequence) is not None):
         return [], sequence
     if found.is_mixed:
-        # steps of a velocity fit no axes, and have a finding of their own
-        if velocity_steps(sequence) is not None:
-            return [], sequence
         cause = (
             f"velocities change as the IMU measures, {found.ratio:.2g} times closer, "
             "with axes that are no rotation: along beams, or of wrong scale"
@@ -507,17 +478,17 @@ def axes_findings(
         return [no_axes_finding(DVL_AXES, cause)], sequence
     if found.scale != 1.0:
         return scaled_dvl(found, sequence, config)
-    is_as_read = (found.gyro == np.eye(3)).all() and (found.dvl == np.eye(3)).all()
-    if not is_as_read and found.ratio < CLEARLY_BETTER:
+    is_gyro = (found.gyro != np.eye(3)).any()
+    is_dvl = (found.dvl != np.eye(3)).any()
+    if (is_gyro or is_dvl) and found.ratio < CLEARLY_BETTER:
         cause = f"{CONTRADICTED}, and no axes fit clearly better"
         return [no_axes_finding(ANY_AXES, cause)], sequence
-    findings = list[Finding]()
     # gravity is felt upwards: of the accelerometers only level axes can be wrong
     is_level = found.dvl[2, 2] == 1.0
-    is_force = is_of_force(found.gyro, found.dvl) and is_level
-    if is_force and (found.dvl != np.eye(3)).any():
+    if is_dvl and is_level and is_of_force(found.gyro, found.dvl):
         return force_axes(found, sequence, config)
-    if (found.gyro != np.eye(3)).any():
+    findings = list[Finding]()
+    if is_gyro:
         names = ", ".join(signed_axes(found.gyro))
         cause = (
             f"gravity and velocity change, {found.ratio:.2g} times closer, as gyro rates about the axes ({names}) would "
@@ -525,13 +496,14 @@ def axes_findings(
         )
         findings.append(gyro_axes_finding(found.gyro, cause, sequence, config))
         sequence = scaled_gyros(sequence, found.gyro)
-    turn = vertical_turn(found.dvl)
-    if turn is not None:
-        pair = TurnedPair(sequence, np.array([0.0, 0.0, turn]))
+    # of a permutation the angle of a turn about the vertical is exact
+    yaw_rad = float(np.arctan2(found.dvl[1, 0], found.dvl[0, 0]))
+    if is_level and yaw_rad and np.linalg.det(found.dvl) > 0:
+        pair = TurnedPair(sequence, np.array([0.0, 0.0, yaw_rad]))
         cause = axes_cause(found)
         findings.append(pair.finding(DVL_AXES, unknown(WRONG_AXES), cause))
         sequence = pair.corrected()
-    elif (found.dvl != np.eye(3)).any():
+    elif is_dvl:
         axes = found.dvl if found.is_vertical_sure else upright(found.dvl, sequence)
         cause = axes_cause(replace(found, dvl=axes))
         findings.append(dvl_axes_finding(axes, cause, sequence))
@@ -548,7 +520,7 @@ def scaled_dvl(
     line = scale_line("dvl", "scale", config, times)
     finding = contradiction(DVL_UNIT, cause, line, WRONG_UNIT)
     dvl = sequence.dvl
-    scaled = Dvl(dvl.stamps_ns, found.scale * dvl.velocity, dvl.velocity_cov)
+    scaled = replace(dvl, velocity=found.scale * dvl.velocity)
     return [finding], replace(sequence, dvl=scaled)
 
 
@@ -636,19 +608,10 @@ def dvl_axes_finding(axes: Floats, cause: str, sequence: Sequence) -> Finding:
 
 def axes_cause(found: AxesMatch) -> str:
     """How much better the axes of the Doppler log fit the IMU."""
+    about = f"the axes ({', '.join(signed_axes(found.dvl))})"
     if np.abs(found.dvl).max(axis=1).min() < 1.0:
-        return f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about turned axes"
-    return (
-        f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about the axes "
-        f"({', '.join(signed_axes(found.dvl))})"
-    )
-
-
-def vertical_turn(axes: Floats) -> float | None:
-    """Angle of a turn about the vertical, rad; None for other axes and for none."""
-    is_turn = axes[2, 2] == 1.0 and np.linalg.det(axes) > 0
-    yaw_rad = float(np.arctan2(axes[1, 0], axes[0, 0]))
-    return yaw_rad if is_turn and yaw_rad else None
+        about = "turned axes"
+    return f"velocity changes as the IMU measures, {found.ratio:.2g} times closer, about {about}"
 
 
 def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
@@ -656,7 +619,8 @@ def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
     R = sequence.calibration.dvl.mounting.pose().rotation().matrix()
     turn = R.T @ axes @ R
     dvl = sequence.dvl
-    turned = Dvl(dvl.stamps_ns, dvl.velocity @ turn.T, turn @ dvl.velocity_cov @ turn.T)
+    cov = turn @ dvl.velocity_cov @ turn.T
+    turned = replace(dvl, velocity=dvl.velocity @ turn.T, velocity_cov=cov)
     return replace(sequence, dvl=turned)
 
 
@@ -680,43 +644,37 @@ def motion_findings(
         cause = f"{' and '.join(against_gyros)} turn as gyro rates about the axes (x, y, -z) would have it"
         found.append(gyro_axes_finding(Z_NEGATED, cause, right, config))
         rightly_turned = scaled_gyros(right, Z_NEGATED)
-    scale = HeadingScale.of(rightly_turned, matches[HEADING])
-    if scale and scale.is_shared and rightly_turned is right:
+    scaled, apart = with_scale_of_heading(rightly_turned, matches[HEADING])
+    if rightly_turned is right and scaled is not right:
         found += heading_findings(matches[HEADING], right, config, motion)
-        rightly_turned = scaled_gyros(right, scale.gain * np.eye(3))
+        rightly_turned = scaled
     if rightly_turned is not right:
         right = rightly_turned
         motion = BodyMotion.of(right)
         assert motion is not None
         matches = {check: check.compare(right, motion) for check in CHECKS}
     found += start_depth_findings(right)
-    # vehicles on wheels stay level
-    has_up = motion.felt is not None
-    has_up |= right.calibration.odometry_interpolation != "linear"
+    # without gravity the tilt of the vehicle is unknown; vehicles on wheels stay level
+    is_rolling = right.calibration.odometry_interpolation != "linear"
+    has_up = is_rolling or motion.felt is not None
     for check in (DEPTH, RANGE, AZIMUTH):
         match = matches[check]
-        # without gravity the tilt of the vehicle is unknown
-        if match is not None and not has_up:
-            match = Match.unknown(NO_GRAVITY)
         # the place of a landmark depends on its range
         is_range_wrong = check is AZIMUTH and any(
             f.grave and f.quantity.startswith(RANGE.name) for f in found
         )
         if match is not None and not is_range_wrong:
+            match = match if has_up else Match.unknown(NO_GRAVITY)
             found += findings_of(check, match, right, config)
     named = {f.quantity for f in found}
     of_heading = [
-        f
+        judged_scale(f, apart)
         for f in heading_findings(matches[HEADING], right, config, motion)
         if f.quantity not in named
     ]
-    if scale is not None:
-        of_heading = [scale.judged(f) for f in of_heading]
-    is_heading_wrong = any(
-        f.quantity == HEADING.quantity and f.acts for f in of_heading
-    )
+    is_turn_wrong = any(f.quantity == HEADING.quantity and f.acts for f in of_heading)
     vertical = vertical_bias(right, motion, bias)
-    if vertical is not None and not is_heading_wrong:
+    if vertical is not None and not is_turn_wrong:
         found.append(vertical)
     found += of_heading
     # positions, where there are any, give the angle itself
@@ -737,12 +695,10 @@ def reversed_dvl(
 ) -> tuple[Finding, Floats] | None:
     """A Doppler log against which depth and ranges run, or depths that are right, and its axes; None where it is right."""
     against = names_of_opposite(matches, (DEPTH, RANGE))
-    if len(against) > 1:
-        axes = BACKWARDS
-    elif against == [DEPTH.name] and begins_below_water(right):
-        axes = Z_NEGATED
-    else:
+    is_z = against == [DEPTH.name] and begins_below_water(right)
+    if not is_z and len(against) < 2:
         return None
+    axes = Z_NEGATED if is_z else BACKWARDS
     names = ", ".join(signed_axes(axes))
     cause = f"changes of {' and '.join(against)} are as velocities about the axes ({names}) would have them"
     return dvl_axes_finding(axes, cause, right), axes
@@ -772,44 +728,40 @@ def names_of_opposite(
     matches: Mapping[Check, Match | None], checks: Iterable[Check]
 ) -> list[str]:
     """Names of sensors that are mirrored, or run against their reference."""
-    found = ((check.name, matches[check]) for check in checks)
     return [
-        name
-        for name, match in found
-        if match is not None and (match.is_mirrored or is_surely_negative(match))
+        check.name
+        for check in checks
+        if (match := matches[check]) is not None
+        and (match.is_mirrored or is_surely_negative(match))
     ]
 
 
-class HeadingScale(NamedTuple):
-    """Scale of the heading over the gyros, and what other sensors make of gyros that are scaled by as much."""
+def with_scale_of_heading(
+    right: Sequence, of_heading: Match | None
+) -> tuple[Sequence, str]:
+    """The sequence with gyros scaled as the heading has it, where others bear that out, and the sensors that contradict it.
 
-    gain: float
-    apart: str
-    """Names of sensors that agree with such gyros less; empty without any."""
-    is_shared: bool
-    """True where azimuths or fixes agree with them better, and no sensor less: the gyros are wrong."""
+    Azimuths or fixes must agree with such gyros better, and no sensor less.
+    """
+    if of_heading is None or of_heading.misfit >= MOST_MISFIT:
+        return right, ""
+    gain = of_heading.gain
+    is_off = matters(gain.minus(1.0), HEADING.least_scale)
+    if not (is_off and 1 / OTHER_UNIT < gain.value < OTHER_UNIT):
+        return right, ""
+    scaled = scaled_gyros(right, gain.value * np.eye(3))
+    apart = brought_apart(right, scaled)
+    nearer = brought_apart(scaled, right)
+    is_shared = AZIMUTH.name in nearer or POSITIONS.name in nearer
+    return (scaled if is_shared and not apart else right), apart
 
-    @classmethod
-    def of(cls, right: Sequence, of_heading: Match | None) -> "HeadingScale | None":
-        """None where the heading turns as the gyros do, or not by a scale."""
-        if of_heading is None or of_heading.misfit >= MOST_MISFIT:
-            return None
-        gain = of_heading.gain
-        is_scale = 1 / OTHER_UNIT < gain.value < OTHER_UNIT
-        if not is_scale or not matters(gain.minus(1.0), HEADING.least_scale):
-            return None
-        scaled = scaled_gyros(right, gain.value * np.eye(3))
-        apart = brought_apart(right, scaled)
-        nearer = brought_apart(scaled, right)
-        by_others = AZIMUTH.name in nearer or POSITIONS.name in nearer
-        return cls(gain.value, apart, by_others and not apart)
 
-    def judged(self, finding: Finding) -> Finding:
-        """The row of the heading's scale, which is its own where other sensors agree with the gyros."""
-        if not (self.apart and finding.acts and finding.quantity == HEADING.quantity):
-            return finding
-        cause = f"the gyros fit {self.apart} as they are: the heading has a wrong scale, or deviates with its direction"
-        return replace(finding, cause=cause, line=unused(HEADING.role))
+def judged_scale(finding: Finding, apart: str) -> Finding:
+    """The row of the heading's scale, which is its own where other sensors agree with the gyros as they are."""
+    if not (apart and finding.acts and finding.quantity == HEADING.quantity):
+        return finding
+    cause = f"the gyros fit {apart} as they are: the heading has a wrong scale, or deviates with its direction"
+    return replace(finding, cause=cause, line=unused(HEADING.role))
 
 
 def dvl_findings(
@@ -821,19 +773,12 @@ def dvl_findings(
     yaw = found.turn[2]
     turn_rad = (0.0, 0.0, yaw.value if yaw.is_known else 0.0)
     rpy = turned_mounting(sequence.calibration.dvl.mounting, turn_rad)
-    turned = Finding(
-        YAW,
-        in_degrees(yaw),
-        "°",
-        "turn the DVL's mounting",
-        line=f"`dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
-    )
-    scaled = Finding(
-        "DVL scale",
-        found.scale,
-        cause="scale the DVL's velocities",
-        line=scale_line("dvl", "scale", config, 1.0 / found.scale.value),
-    )
+    line = f"`dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}"
+    cause = "turn the DVL's mounting"
+    turned = Finding(YAW, in_degrees(yaw), "°", cause, line=line)
+    line = scale_line("dvl", "scale", config, 1.0 / found.scale.value)
+    cause = "scale the DVL's velocities"
+    scaled = Finding("DVL scale", found.scale, cause=cause, line=line)
     return [
         judged(late, offset, LEAST_OFFSET_S, large=LARGE_OFFSET_S),
         judged(turned, yaw, LEAST_YAW_RAD, large=LARGE_TURN_RAD),
@@ -856,9 +801,8 @@ def brought_apart(before: Sequence, after: Sequence) -> str:
         off = agrees.gain.minus(1.0)
         error = abs(off.value) - abs(agreed.gain.value - 1.0)
         # the same rows twice, whose noise is common to both; a gain that would be right in itself decides nothing
-        is_worse = error > PAIRED_SIGMAS * agrees.gain.sigma
-        is_off = is_worse and matters(off, check.least_scale)
-        if is_off or agrees.scatter > CLEARLY_BETTER * agreed.scatter:
+        is_worse = error > PAIRED_SIGMAS * off.sigma and matters(off, check.least_scale)
+        if is_worse or agrees.scatter > CLEARLY_BETTER * agreed.scatter:
             names.append(check.name)
     return " and ".join(names)
 
@@ -887,9 +831,8 @@ def with_instant(offset: Estimate1D, imu: Imu) -> Estimate1D:
     if len(imu) < 2:
         return offset
     interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
-    return replace(
-        offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12)))
-    )
+    sigma = float(np.hypot(offset.sigma, interval_s / np.sqrt(12)))
+    return replace(offset, sigma=sigma)
 
 
 def corrected_sequence(
@@ -898,44 +841,45 @@ def corrected_sequence(
     """Sequence with the advised changes: stamps, yaw and scale of the DVL, lever arm, sigma of the gyro bias."""
     is_late, is_turned, is_scaled = (finding.acts for finding in of_dvl)
     dvl = sequence.dvl
+    if is_late:
+        shift_ns = round(match.offset.value * NS_PER_S)
+        dvl = replace(dvl, stamps_ns=dvl.stamps_ns + shift_ns)
+    if is_scaled:
+        dvl = replace(dvl, velocity=dvl.velocity * match.scale.value)
     calibration = with_fitted(match, sequence.calibration)
-    shift_ns = round(match.offset.value * NS_PER_S) if is_late else 0
-    velocity = dvl.velocity * (match.scale.value if is_scaled else 1.0)
-    moved = Dvl(dvl.stamps_ns + shift_ns, velocity, dvl.velocity_cov)
-    right = replace(sequence, dvl=moved, calibration=calibration)
+    right = replace(sequence, dvl=dvl, calibration=calibration)
     turn_rad = np.array([0.0, 0.0, match.turn[2].value])
     return TurnedPair(right, turn_rad).as_if("dvl") if is_turned else right
 
 
 def leaning_pair(match: DvlMatch, sequence: Sequence) -> tuple[list[Finding], Sequence]:
     """Doppler log and IMU that are turned against each other about a level axis, and the sequence with it put right."""
-    known_rad = [one.value if one.is_known else 0.0 for one in match.turn[:2]]
+    known_rad = known_values(match.turn[:2])
     axis = int(np.argmax(np.abs(known_rad)))
     if not matters(match.turn[axis], LEAST_LEAN_RAD):
         return [], sequence
-    pair = TurnedPair(sequence, np.array([*known_rad, 0.0]))
+    pair = TurnedPair(sequence, np.append(known_rad, 0.0))
     angle = in_degrees(match.turn[axis])
     return [pair.finding(LEVEL_TURNS[axis], angle, TURNED)], pair.corrected()
 
 
 def surest_bias(
-    match: DvlMatch, tilt: StartTilt
+    of_drive: Estimates3D, tilt: StartTilt
 ) -> tuple[Estimates3D, tuple[str, str, str]]:
     """Gyro bias of the whole drive or of a rest, whichever is more certain on each axis, and its source."""
-    still = tilt.gyro_bias() or match.gyro_bias
-    pairs = list[tuple[Estimate1D, str]]()
-    for at_rest, driven in zip(still, match.gyro_bias, strict=True):
-        pair = (driven, FROM_DRIVE)
-        other = (at_rest, tilt.said)
+    still = tilt.gyro_bias() or of_drive
+    found = list[tuple[Estimate1D, str]]()
+    for at_rest, driven in zip(still, of_drive, strict=True):
+        pair = [(driven, FROM_DRIVE), (at_rest, tilt.said)]
         if tilt.is_rest and (not driven.is_known or at_rest.sigma < driven.sigma):
-            pair, other = other, pair
-        (bias, source), (rival, of_rival) = pair, other
+            pair.reverse()
+        (bias, source), (rival, of_rival) = pair
         apart = bias.minus(rival.value)
         # a bias that changed is one row with both numbers
         if rival.is_known and matters(apart, LEAST_BIAS_RAD_S, rival.sigma):
             source += f" ({of_rival} {with_interval(rival, 'rad/s')})"
-        pairs.append((bias, source))
-    (x, of_x), (y, of_y), (z, of_z) = pairs
+        found.append((bias, source))
+    (x, of_x), (y, of_y), (z, of_z) = found
     return (x, y, z), (of_x, of_y, of_z)
 
 
@@ -944,13 +888,14 @@ def with_vertical(bias: Estimates3D, vertical: Estimate1D, up: Floats) -> Estima
     if not vertical.is_known or not all(one.is_known for one in bias):
         return bias
     axis = int(np.argmax(np.abs(up)))
+    before = bias[axis]
     beside = sum(one.value * up[k] for k, one in enumerate(bias) if k != axis)
     by_heading = (vertical.value - beside) / up[axis]
-    apart = replace(vertical, value=by_heading).minus(bias[axis].value)
-    if matters(apart, LEAST_BIAS_RAD_S, bias[axis].sigma):
+    apart = replace(vertical, value=by_heading - before.value)
+    if matters(apart, LEAST_BIAS_RAD_S, before.sigma):
         return bias
-    estimates = [(bias[axis].value, bias[axis].sigma), (by_heading, vertical.sigma)]
-    x, y, z = (weighted(estimates) if k == axis else one for k, one in enumerate(bias))
+    both = weighted([(before.value, before.sigma), (by_heading, vertical.sigma)])
+    x, y, z = (both if k == axis else one for k, one in enumerate(bias))
     return x, y, z
 
 
@@ -958,14 +903,11 @@ def without_acting_bias(
     sequence: Sequence, bias: Estimates3D
 ) -> tuple[Sequence, Estimates3D]:
     """The sequence with the bias that its line states, and what is left of the bias."""
-    calibration = sequence.calibration
-    acting = acting_bias(bias, calibration.imu)
-    x, y, z = (
-        one.minus(stated.value) for one, stated in zip(bias, acting, strict=True)
-    )
-    calibration = calibration.model_copy(
-        update={"imu": with_bias(bias, calibration.imu)}
-    )
+    imu = sequence.calibration.imu
+    acting = [one.value for one in acting_bias(bias, imu)]
+    x, y, z = map(Estimate1D.minus, bias, acting)
+    update = {"imu": with_bias(bias, imu)}
+    calibration = sequence.calibration.model_copy(update=update)
     return replace(sequence, calibration=calibration), (x, y, z)
 
 
@@ -975,49 +917,45 @@ def reference_findings(
     """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
     reference = right.true_poses
-    mirrored = mirrored_reference(right, config)
-    if reference is None or mirrored is not None:
-        if mirrored is not None:
-            yield mirrored
+    mirrored = list(mirrored_reference(right, config))
+    yield from mirrored
+    if reference is None or mirrored:
         yield from tilt_findings(tilt, right.calibration, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, reference, right.calibration)
     offset = with_instant(found.offset, right.imu)
     late = offset_row("reference against IMU", offset, "truth", config)
     yield judged(late, offset, LEAST_OFFSET_S)
-    jump = Finding(
-        "first headings of the reference: error",
-        in_degrees(found.start_heading),
-        "°",
-        "the reference begins with a wrong heading: leave its beginning out with `--start`",
-    )
-    yield judged(jump, found.start_heading, LEAST_HEADING_RAD)
-    heading = None
+    error = found.start_heading
+    cause = "the reference begins with a wrong heading: leave its beginning out with `--start`"
+    quantity = "first headings of the reference: error"
+    jump = Finding(quantity, in_degrees(error), "°", cause)
+    yield judged(jump, error, LEAST_HEADING_RAD)
+    of_heading = list[Finding]()
+    yaw_rad = start.rpy_rad[2]
     # a start that is found in the map, or that defines the world, has no heading that could be wrong
     if offset.is_known and start != Start() and start.source not in ("map", "vehicle"):
-        heading = find_start_heading(right, reference, offset)
-    # rows on the start must not contradict each other
-    is_wrong = heading is not None and heading.acts
-    yaw_rad = heading.rpy_rad[2] if heading and is_wrong else start.rpy_rad[2]
+        heading, true_yaw_rad = start_heading_finding(right, reference, offset, tilt)
+        of_heading.append(heading)
+        # rows on the start must not contradict each other
+        if heading.acts:
+            yaw_rad = true_yaw_rad
     yield from tilt_findings(tilt, right.calibration, yaw_rad)
-    if heading is not None:
-        yield heading.finding(tilt)
+    yield from of_heading
 
 
-def mirrored_reference(sequence: Sequence, config: LogConfig) -> Finding | None:
-    """A reference whose level path is the mirror image of that by gyros and Doppler log; None where it is not."""
+def mirrored_reference(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """A reference whose level path is the mirror image of that by gyros and Doppler log; nothing where it is not."""
     motion = BodyMotion.of(sequence)
     truth = sequence.truth
     if motion is None or truth is None:
-        return None
+        return
     unknown_m2 = np.full((len(truth), 3, 3), np.nan)
     places = PositionFixes(truth.stamps_ns, truth.positions, unknown_m2)
     found = fix_match(replace(sequence, positions=places), motion)
-    if found is None or not found.gain.is_known or not found.is_mirrored:
-        return None
-    if found.misfit >= MOST_MISFIT:
-        return None
-    return contradiction(
+    if found is None or not found.is_mirrored or found.misfit >= MOST_MISFIT:
+        return
+    yield contradiction(
         "reference: path over that by gyros and Doppler log",
         "it is its mirror image: north, east, down instead of east, north, up; all errors are of that",
         f'{other_world(config, "truth")}, and `rotation = "frd"` where its orientations are of a body with z down; or the '
@@ -1033,12 +971,12 @@ SECOND_DIFFERENCE = float(np.sqrt(6.0))
 """Sigma of ``v[k] - 2 v[k + 1] + v[k + 2]`` over that of v."""
 
 
-def stated_noise(dvl: Dvl) -> Finding | None:
-    """Stated sigma of velocities that exceeds their scatter and their size; None where it does not, or none is stated."""
+def stated_noise(dvl: Dvl) -> Iterator[Finding]:
+    """Stated sigma of velocities that exceeds their scatter and their size; nothing where it does not, or none is stated."""
     variances = np.einsum("nii->ni", dvl.velocity_cov)
     stated = np.isfinite(variances).all(axis=1)
     if np.count_nonzero(stated) < FEWEST_STATED:
-        return None
+        return
     velocity = dvl.velocity[stated]
     sigma_m_s = float(np.sqrt(np.median(variances[stated])))
     bent = np.abs(velocity[2:] - 2.0 * velocity[1:-1] + velocity[:-2])
@@ -1046,8 +984,8 @@ def stated_noise(dvl: Dvl) -> Finding | None:
     scatter_m_s = float(np.median(bent)) / (0.6745 * SECOND_DIFFERENCE)
     size_m_s = float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
     if sigma_m_s <= max(LARGEST_STATED * scatter_m_s, size_m_s):
-        return None
-    return contradiction(
+        return
+    yield contradiction(
         "DVL noise: stated sigma",
         f"{sigma_m_s:.2g} m/s, while successive velocities of {size_m_s:.2g} m/s scatter by {scatter_m_s:.2g} m/s: mm/s "
         "instead of m/s?",
@@ -1058,34 +996,29 @@ def stated_noise(dvl: Dvl) -> Finding | None:
 
 def noise_findings(sequence: Sequence) -> Iterator[Finding]:
     """Noise densities of gyro and accelerometer, where the DVL confirms the rest: a steady drive can be as quiet."""
-    if (stated := stated_noise(sequence.dvl)) is not None:
-        yield stated
+    yield from stated_noise(sequence.dvl)
     found = noise_densities(sequence.imu)
     imu = sequence.calibration.imu
     speed = resting_speed(sequence)
     steady = f"{found.still_s:.0f} s are steady, but at {speed:.1f} m/s"
-    rows = {
-        "gyro noise density": (found.gyro, "gyro_noise_density", "rad/s/√Hz"),
-        "accelerometer noise density": (
-            found.accel,
-            "accel_noise_density",
-            "m/s²/√Hz",
-        ),
-    }
-    for quantity, (estimate, key, unit) in rows.items():
+    rows = (
+        ("gyro", found.gyro, imu.gyro_noise_density, "rad/s/√Hz"),
+        ("accelerometer", found.accel, imu.accel_noise_density, "m/s²/√Hz"),
+    )
+    for sensor, estimate, given, unit in rows:
         if estimate.is_known and speed > LARGEST_RESTING_M_S:
             estimate = replace(estimate, reason=steady)
-        given = getattr(imu, key)
         rest = f"from {found.still_s:.0f} s of rest"
         fits = f"{rest}; the calibration's {given:.2g} fits, {NO_NEED}"
-        row = Finding(quantity, estimate, unit, fits)
-        is_other = estimate.value > 0 and given > 0
-        if is_other:
-            is_other = abs(np.log(estimate.value / given)) > np.log(
-                LARGEST_DENSITY_RATIO
-            )
-        if (is_other or not given) and matters(estimate.minus(given), 0.0):
-            line = f"`imu.{key} = {estimate.value:.2g}` {IN_CALIBRATION}"
+        row = Finding(f"{sensor} noise density", estimate, unit, fits)
+        is_near = (
+            given / LARGEST_DENSITY_RATIO
+            <= estimate.value
+            <= given * LARGEST_DENSITY_RATIO
+        )
+        if not is_near and matters(estimate.minus(given), 0.0):
+            key = sensor.removesuffix("erometer")
+            line = f"`imu.{key}_noise_density = {estimate.value:.2g}` {IN_CALIBRATION}"
             cause = f"{rest}, not the calibration's {given:.2g}"
             row = replace(row, cause=cause, line=line, gravity=Gravity.ACT)
         yield row

@@ -42,7 +42,6 @@ STEP_SIGMAS = 10.0
 """Far beyond the largest of a long log's differences by noise, also where it has heavy tails."""
 LEAST_STEP = 4.0
 """In sigmas of a row: a coarse sensor has no typical difference."""
-STEP_RATIO = 3.0
 MOST_STEPS = 5
 SMALL_SAMPLE = 1.2
 """Quantile of Student's t for a dozen blocks over that of the normal distribution, between 2 and 4 sigma."""
@@ -63,9 +62,14 @@ class SignalStretch:
     beside: Callable[[Floats], Values] | None = None
     """What else may move the sensor, shape (n, q), by the table of checks."""
 
+    @property
+    def x(self) -> Values:
+        """Reference at the rows, shape (n,)."""
+        return self.shifted(np.zeros(1))[0]
+
     def excess(self) -> "SignalStretch":
         """What the sensor has beyond its reference, ``y - x``, as a signal of its own."""
-        return replace(self, y=self.y - self.shifted(np.zeros(1))[0])
+        return replace(self, y=self.y - self.x)
 
     def shifted(self, lags_s: Floats) -> Values:
         """Reference at the rows for each lag, shape (k, n)."""
@@ -255,15 +259,13 @@ def refined(
     lags = list[tuple[float, float]]()
     residuals = list[Values]()
     for stretch in stretches:
+        x = stretch.shifted(np.array([lag_s]))[0]
+        columns = np.column_stack([x, stretch.slope(lag_s)] if find_lag else [x])
         # one candidate: the grid has chosen the lag and the sense
-        x = stretch.shifted(np.array([lag_s]))[:, :, None]  # (1, n, 1)
-        x = x.conj() if is_mirrored else x
-        found = RobustFit.of(x, stretch, drift_sigma)
+        columns = (columns.conj() if is_mirrored else columns)[None]  # (1, n, p)
+        found = RobustFit.of(columns[:, :, :1], stretch, drift_sigma)
         if find_lag:
-            slope = stretch.slope(lag_s)[None, :, None]
-            slope = slope.conj() if is_mirrored else slope
             # a far row with a large slope would make a delay of its own
-            columns = np.concatenate([x, slope], axis=2)  # (1, n, 2)
             found = RobustFit.of(columns, stretch, drift_sigma, found.kept)
         if not found.rows[0]:
             continue
@@ -313,11 +315,6 @@ class Explained:
         size = float(np.linalg.norm(self.q / np.maximum(self.sigmas, 1e-12)))
         return size > ACTING_SIGMAS and self.before > CLEARLY_BETTER * self.after
 
-    @property
-    def error(self) -> float:
-        """Root mean square of what the columns explain, in the sensor's unit."""
-        return float(np.sqrt(max(self.before**2 - self.after**2, 0.0)))
-
 
 def explained(
     stretches: Iterable[SignalStretch],
@@ -328,7 +325,8 @@ def explained(
 
     None where some stretch is too short.
     """
-    found = list[tuple[Values, Floats]]()
+    values = list[Values]()
+    precisions = list[Floats]()
     before = list[Values]()
     after = list[Values]()
     for stretch in stretches:
@@ -339,16 +337,17 @@ def explained(
         fit = RobustFit.of(A[None], excess, 0.0)
         if not fit.rows[0]:
             return None
-        found.append((fit.p[0, :wanted], fit.sigmas()[:wanted]))
+        values.append(fit.p[0, :wanted])
+        precisions.append(np.maximum(fit.sigmas()[:wanted], 1e-12) ** -2)
         # of the same rows, so that an outlier is not what was explained
         before.append(without.residuals[0, fit.kept[0]])
         after.append(fit.residuals[0, fit.kept[0]])
-    if not found:
+    if not values:
         return None
-    q = np.array([values for values, _ in found])  # (stretches, q)
-    weights = np.array([np.maximum(sigmas, 1e-12) ** -2 for _, sigmas in found])
-    mean = np.sum(weights * q, axis=0) / np.sum(weights, axis=0)
-    sigmas = 1.0 / np.sqrt(np.sum(weights, axis=0))
+    weights = np.array(precisions)  # (stretches, q)
+    total = np.sum(weights, axis=0)
+    mean = np.sum(weights * np.array(values), axis=0) / total
+    sigmas = 1.0 / np.sqrt(total)
     return Explained(mean, sigmas, root_mean_square(before), root_mean_square(after))
 
 
@@ -362,7 +361,7 @@ class SignalStep(NamedTuple):
 
 
 def steps(
-    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float = STEP_RATIO
+    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float
 ) -> list[SignalStep]:
     """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
 
@@ -419,7 +418,7 @@ def centred(values: Values, stretch: SignalStretch) -> Values:
 
 def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
     """Reference at the rows about its mean, or about a line, shape (n,)."""
-    x = stretch.shifted(np.zeros(1))[0]
+    x = stretch.x
     if not has_drift:
         return centred(x, stretch)
     known = np.isfinite(x)

@@ -14,9 +14,10 @@ from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     NO_NEED,
     Finding,
-    Gravity,
+    gravity_of,
     in_degrees,
     judged,
+    known_values,
     matters,
     numbers,
     said_once,
@@ -71,9 +72,8 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
         f"`dvl.mounting.translation_m = {numbers(dvl, 3)}`"
     )
     rows = list[Finding]()
-    for axis, estimate, place in zip(
-        AXES, found.lever, given_arm(calibration), strict=True
-    ):
+    given = given_arm(calibration)
+    for axis, estimate, place in zip(AXES, found.lever, given, strict=True):
         of_calibration = f"the calibration's {place:+.2f} m"
         name = f"{ARM}, {axis}"
         row = Finding(name, estimate, "m", f"not {of_calibration}", line=line)
@@ -115,11 +115,9 @@ def accel_bias_findings(
     """A row for each axis on which the accelerometers' bias is beyond its sigma, and the calibration with it."""
     imu = calibration.imu
     allowed = imu.accel_bias_sigma
-    if not any(matters(b, LEAST_ACCEL_BIAS_M_S2, allowed) for b in found.accel_bias):
-        return [], calibration
-    in_body = [one.value if one.is_known else 0.0 for one in found.accel_bias]
     body_R_imu = imu.mounting.pose().rotation().matrix()
-    whole = np.add(imu.accel_bias_m_s2, body_R_imu.T @ in_body)
+    in_imu = body_R_imu.T @ known_values(found.accel_bias)
+    whole = np.add(imu.accel_bias_m_s2, in_imu)
     line = f"`imu.accel_bias_m_s2 = {numbers(whole, 3)}` {IN_CALIBRATION}"
     rows = [
         Finding(
@@ -129,13 +127,13 @@ def accel_bias_findings(
             f"from the turns of the drive, beyond the calibration's sigma of {allowed:.2g}: it tilts gravity by "
             f"{np.degrees(abs(one.value) / calibration.gravity_m_s2):.2g}°",
             line=line,
-            gravity=Gravity.GRAVE
-            if abs(one.value) > LARGE_ACCEL_BIAS_M_S2
-            else Gravity.ACT,
+            gravity=gravity_of(abs(one.value) > LARGE_ACCEL_BIAS_M_S2),
         )
         for axis, one in zip(AXES, found.accel_bias, strict=True)
         if matters(one, LEAST_ACCEL_BIAS_M_S2, allowed)
     ]
+    if not rows:
+        return [], calibration
     known = imu.model_copy(update={"accel_bias_m_s2": tuple(whole.tolist())})
     return said_once(rows), calibration.model_copy(update={"imu": known})
 
@@ -150,10 +148,8 @@ def acting_bias(bias: Estimates3D, imu: ImuCalibration) -> list[Estimate1D]:
 def with_bias(bias: Estimates3D, imu: ImuCalibration) -> ImuCalibration:
     """Calibration with the bias and its sigma that the findings advise."""
     acting = acting_bias(bias, imu)
-    along_imu = imu.mounting.pose().rotation().matrix().T @ [
-        one.value for one in acting
-    ]
-    whole = np.add(imu.gyro_bias_rad_s, along_imu)
+    body_R_imu = imu.mounting.pose().rotation().matrix()
+    whole = np.add(imu.gyro_bias_rad_s, body_R_imu.T @ known_values(acting))
     sigma = max(imu.gyro_bias_sigma, *(one.sigma for one in acting))
     update = {"gyro_bias_rad_s": tuple(whole.tolist()), "gyro_bias_sigma": sigma}
     return imu.model_copy(update=update)
@@ -177,7 +173,7 @@ def bias_findings(
         f"`imu.gyro_bias_rad_s = {numbers(right.gyro_bias_rad_s, 5)}` and "
         f"`imu.gyro_bias_sigma = {right.gyro_bias_sigma:.2g}` {IN_CALIBRATION}"
     )
-    turned_rad = D_heading @ [one.value for one in acting_bias(bias, imu)]
+    turned_rad = D_heading @ known_values(acting_bias(bias, imu))
     # all axes together turn the vehicle
     large = 0.0 if abs(turned_rad) > LARGE_TURN_RAD else np.inf
     rows = list[Finding]()
@@ -256,12 +252,11 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     imu = until_hole(imu)
     try:
         tilt = align_in_motion(imu, dvl, sequence.calibration)
+        return StartTilt(tilt, f"from {span_s(imu):.0f} s in motion")
     except AlignmentError as error:
         reason = without_advice(error)
     except np.linalg.LinAlgError:
         reason = "the calibration's noise is zero"
-    else:
-        return StartTilt(tilt, f"from {span_s(imu):.0f} s in motion")
     return StartTilt(None, f"at rest: {found.said}; in motion: {reason}")
 
 
@@ -356,13 +351,9 @@ def tilt_findings(
     for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
         given = start.rpy_rad[axis]
         stated = f"the calibration's {np.degrees(given):+.2f}°"
-        row = Finding(
-            f"start {name}: value",
-            in_degrees(angle),
-            "°",
-            f"{found.said}, not {stated}",
-            line=line,
-        )
+        cause = f"{found.said}, not {stated}"
+        quantity = f"start {name}: value"
+        row = Finding(quantity, in_degrees(angle), "°", cause, line=line)
         of_row = judged(
             row,
             replace(angle, value=wrap_angle(angle.value - given)),
@@ -375,62 +366,40 @@ def tilt_findings(
     return said_once(rows)
 
 
-@dataclass(frozen=True, eq=False)
-class StartHeading:
-    """Pose of the reference at the start, and error of the calibration's heading."""
+def start_heading_finding(
+    sequence: Sequence, reference: Trajectory, offset: Estimate1D, tilt: StartTilt
+) -> tuple[Finding, float]:
+    """The stated heading against the reference at that instant, its stamps corrected by an offset in s; the right one, rad.
 
-    rpy_rad: tuple[float, float, float]
-    position_m: tuple[float, float, float]
-    error: Estimate1D
-    """Rad."""
-    allowed_rad: float
-    """Sigma that the calibration gives its heading."""
-
-    @property
-    def acts(self) -> bool:
-        """True where the calibration's heading should be changed."""
-        return matters(self.error, LEAST_HEADING_RAD, self.allowed_rad)
-
-    def finding(self, tilt: StartTilt) -> Finding:
-        """The row, with roll and pitch of the alignment if known, so that rows agree; else those of the reference."""
-        rpy = self.rpy_rad
-        of_tilt = ""
-        if tilt.tilt is not None:
-            rpy = (tilt.tilt.roll_rad, tilt.tilt.pitch_rad, self.rpy_rad[2])
-            of_tilt = f", with roll and pitch {tilt.said}"
-        row = Finding(
-            "start heading: error",
-            in_degrees(self.error),
-            "°",
-            f"the calibration's start heading is wrong; by the reference, its stamps put right{of_tilt}",
-            line=f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` "
-            f"{IN_CALIBRATION}; the position too is the reference's, so that both are of one pose",
-        )
-        return judged(row, self.error, LEAST_HEADING_RAD, allowed=self.allowed_rad)
-
-
-def find_start_heading(
-    sequence: Sequence, reference: Trajectory, offset: Estimate1D
-) -> StartHeading:
-    """Compare the calibration's start with the reference at that instant, its stamps corrected by an offset in s."""
+    The line has roll and pitch of the alignment if known, so that rows agree; else those of the reference.
+    """
     first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
     corrected_ns = sequence.start_ns - round(offset.value * NS_PER_S)
     at_ns = int(np.clip(corrected_ns, first_ns, last_ns))
     pose = reference.at(np.array([at_ns]))
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
-    x, y, z = pose.positions[0].tolist()
-    error = wrap_angle(sequence.calibration.start.rpy_rad[2] - yaw)
-    begin_ns = max(at_ns - TURN_OVER_NS // 2, first_ns)
-    end_ns = min(at_ns + TURN_OVER_NS // 2, last_ns)
-    turn_rate = 0.0
-    if end_ns > begin_ns:
-        begin, end = reference.at(np.array([begin_ns, end_ns])).rotations()
-        turned_rad = float((begin.inv() * end).magnitude())
-        turn_rate = turned_rad * NS_PER_S / (end_ns - begin_ns)
+    of_tilt = ""
+    if tilt.tilt is not None:
+        roll, pitch = tilt.tilt.roll_rad, tilt.tilt.pitch_rad
+        of_tilt = f", with roll and pitch {tilt.said}"
+    near_ns = at_ns + np.array([-1, 1]) * (TURN_OVER_NS // 2)
+    near_ns = np.clip(near_ns, first_ns, last_ns)
+    begin, end = reference.at(near_ns).rotations()
+    turned_rad = float((begin.inv() * end).magnitude())
+    turn_rate = turned_rad * NS_PER_S / max(int(np.ptp(near_ns)), 1)
     spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
-    of_error = Estimate1D(error, spread)
-    allowed_rad = sequence.calibration.start.rpy_sigma_rad[2]
-    return StartHeading((roll, pitch, yaw), (x, y, z), of_error, allowed_rad)
+    start = sequence.calibration.start
+    error = Estimate1D(wrap_angle(start.rpy_rad[2] - yaw), spread)
+    row = Finding(
+        "start heading: error",
+        in_degrees(error),
+        "°",
+        f"the calibration's start heading is wrong; by the reference, its stamps put right{of_tilt}",
+        line=f"`start.rpy_rad = {numbers((roll, pitch, yaw), 4)}`, `start.position_m = {numbers(pose.positions[0], 2)}` "
+        f"{IN_CALIBRATION}; the position too is the reference's, so that both are of one pose",
+    )
+    allowed_rad = start.rpy_sigma_rad[2]
+    return judged(row, error, LEAST_HEADING_RAD, allowed=allowed_rad), yaw
 
 
 def beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | None]:

@@ -91,10 +91,8 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
             gravity=Gravity.ACT,
         )
     if fit.start is not None:
-        turn = Estimate1D(
-            wrap_angle(fit.start.parameters[0]),
-            float(np.sqrt(fit.start.covariance[0, 0])),
-        )
+        sigma = float(np.sqrt(fit.start.covariance[0, 0]))
+        turn = Estimate1D(wrap_angle(fit.start.parameters[0]), sigma)
         agreeing = [known.ids[row] for row in fit.start.agreeing]
         fits = f"the sightings of landmarks {listed(agreeing)} fit the map, {NO_NEED}"
         if others := named.difference(known.ids):
@@ -119,14 +117,14 @@ def stated_start_findings(
     """A stated start that is elsewhere than landmarks have it; nothing where both agree by their covariances."""
     start = right.calibration.start
     yaw, x, y = found.parameters.tolist()
-    off = np.array([wrap_angle(yaw - start.rpy_rad[2]), *(x, y)])
-    off[1:] -= start.position_m[:2]
-    stated = [start.rpy_sigma_rad[2], *start.position_sigma_m[:2]]
-    P = found.covariance + np.diag(np.square(stated))
+    stated_x, stated_y, _ = start.position_m
+    turn_rad = wrap_angle(yaw - start.rpy_rad[2])
+    off = np.array([turn_rad, x - stated_x, y - stated_y])
+    sigmas = [start.rpy_sigma_rad[2], *start.position_sigma_m[:2]]
+    P = found.covariance + np.diag(np.square(sigmas))
     is_near = np.hypot(*off[1:]) <= FARTHEST_M and abs(off[0]) <= FARTHEST_RAD
     if is_near or float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
         return
-    stated_x, stated_y, _ = start.position_m
     yield contradiction(
         "start pose",
         estimate="the landmarks have it elsewhere",
@@ -141,31 +139,23 @@ def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
     """The truth at the start; None where they agree or the truth begins later."""
     truth = right.truth
     begin_ns = right.start_ns
-    if (
-        truth is None
-        or len(truth) < 2
-        or not truth.stamps_ns[0] <= begin_ns <= truth.stamps_ns[-1]
-    ):
+    if truth is None or len(truth) < 2:
         return None
-    x, y, z = right.calibration.start.position_m
-    true = truth.at(np.array([begin_ns])).positions[0]
-    off_m = float(np.hypot(*(true[:2] - (x, y))))
+    if not truth.stamps_ns[0] <= begin_ns <= truth.stamps_ns[-1]:
+        return None
+    start = right.calibration.start
+    x, y, _ = truth.at(np.array([begin_ns])).positions[0].tolist()
+    off_m = float(np.hypot(*np.subtract((x, y), start.position_m[:2])))
     soon = motion.seconds <= motion.seconds[0] + STAMPS_S
     way_m = float(np.abs(motion.path_m[soon] - motion.path_m[0]).max())
-    sigma_m = sigma_of(right)
+    sigma_m = float(np.hypot(*start.position_sigma_m[:2]))
     if off_m <= FARTHEST_M + way_m + ACTING_SIGMAS * sigma_m:
         return None
-    place = (float(true[0]), float(true[1]), z)
     return contradiction(
         "start position: distance from the truth",
         estimate=Estimate1D(off_m, sigma_m),
         unit="m",
         cause=f"the truth begins {off_m:.2f} m from the start of the calibration: a log that is joined after its beginning, "
         "or another world of the truth?",
-        line=f"`start.position_m = {numbers(place, 2)}` {IN_CALIBRATION}",
+        line=f"`start.position_m = {numbers((x, y, start.position_m[2]), 2)}` {IN_CALIBRATION}",
     )
-
-
-def sigma_of(right: Sequence) -> float:
-    """Standard deviation of the stated start's place in the level plane, m."""
-    return float(np.hypot(*right.calibration.start.position_sigma_m[:2]))

@@ -27,7 +27,12 @@ from sonar_graph.diagnosis.motion_signals import (
     BodyMotion,
     smoothed,
 )
-from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, match
+from sonar_graph.diagnosis.signals import (
+    CLEARLY_BETTER,
+    Match,
+    match,
+    root_mean_square,
+)
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.numerics import running_integral
@@ -84,15 +89,11 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
     along = level / np.maximum(speed_m_s, 1e-9)[:, None]
     across = np.cross(up, along)
     r = residual(motion, felt.gravity_m_s2)  # (n, 3)
-    is_known = speed_m_s > LEAST_SPEED_M_S
-    is_known &= np.isfinite(r).all(axis=1)
-    if np.count_nonzero(is_known) < FEWEST_ROWS:
+    r[speed_m_s <= LEAST_SPEED_M_S] = np.nan
+    if np.count_nonzero(np.isfinite(r).all(axis=1)) < FEWEST_ROWS:
         return None
-    r[~is_known] = np.nan
-    off_across = np.sum(r * across, axis=1)[is_known]
-    off_along = np.sum(r * along, axis=1)[is_known]
-    noise = max(float(np.sqrt(np.mean(off_along**2))), 1e-12)
-    excess = float(np.sqrt(np.mean(off_across**2))) / noise
+    noise = max(root_mean_square([np.sum(r * along, axis=1)]), 1e-12)
+    excess = root_mean_square([np.sum(r * across, axis=1)]) / noise
     # averaged as the forces are
     turned = running_integral(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
     by_rate = np.gradient(smoothed(t, turned), t, axis=0)
@@ -102,12 +103,12 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
     of_scale = of_scale.limited(LARGEST_SCALE_SIGMA, "even speed")
     # gyros that are wrong spoil that comparison too
     is_scale = abs(of_scale.value - 1.0) < LARGEST_SCALE
-    if not (of_scale.is_known and is_scale):
-        return TurnMatch(found.less_certain(UNKNOWN_SCALE), excess)
-    gain = found.gain
-    ratio = replace(gain, value=gain.value / of_scale.value)
-    unsure = abs(ratio.value) * of_scale.sigma
-    return TurnMatch(replace(found, gain=ratio).less_certain(unsure), excess)
+    unsure = UNKNOWN_SCALE
+    if of_scale.is_known and is_scale:
+        ratio = replace(found.gain, value=found.gain.value / of_scale.value)
+        found = replace(found, gain=ratio)
+        unsure = abs(ratio.value) * of_scale.sigma
+    return TurnMatch(found.less_certain(unsure), excess)
 
 
 def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
@@ -138,9 +139,9 @@ def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
         float(np.radians(1.0)): "degrees?",
         float(np.degrees(1.0)): "radians that were converted twice?",
     }
-    for factor, why in causes.items():
+    for factor, why in causes.items() if is_wrong else ():
         right = rate_match(scaled_gyros(sequence, factor * np.eye(3)))
-        if is_wrong and right and is_borne_out(right.match, sequence):
+        if right and is_borne_out(right.match, sequence):
             cause = f"accelerometers and Doppler log turn otherwise: {why}"
             line = scale_line("imu", "angular_velocity_scale", config, 1.0 / factor)
             return replace(row, cause=cause, line=line)

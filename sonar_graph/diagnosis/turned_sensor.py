@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sonar_graph.calibration import Mounting
 from sonar_graph.diagnosis.aiding_check import POSITIONS, RANGE
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
@@ -43,16 +42,17 @@ class TurnedPair:
         """The sequence with the mounting of one of them, ``dvl`` or ``imu``, put right."""
         calibration = self.sequence.calibration
         section = getattr(calibration, role)
-        turned = section.model_copy(update={"mounting": self.mounting(role)})
-        right = calibration.model_copy(update={role: turned})
+        turned = section.mounting.model_copy(update={"rpy_rad": self.rpy_rad(role)})
+        section = section.model_copy(update={"mounting": turned})
+        right = calibration.model_copy(update={role: section})
         return replace(self.sequence, calibration=right)
 
-    def mounting(self, role: str) -> Mounting:
-        """Mounting of one of them after its turn."""
-        before: Mounting = getattr(self.sequence.calibration, role).mounting
-        turn_rad = self.turn_rad if role == "dvl" else -self.turn_rad
-        rpy_rad = turned_mounting(before, turn_rad)
-        return before.model_copy(update={"rpy_rad": rpy_rad})
+    def rpy_rad(self, role: str) -> tuple[float, float, float]:
+        """Angles of the mounting of one of them after its turn."""
+        before = getattr(self.sequence.calibration, role).mounting
+        return turned_mounting(
+            before, self.turn_rad if role == "dvl" else -self.turn_rad
+        )
 
     def wrong_one(self) -> str:
         """``dvl`` or ``imu``; empty where nothing else decides."""
@@ -111,21 +111,18 @@ class TurnedPair:
     def finding(self, quantity: str, estimate: Estimate1D, cause: str) -> Finding:
         """A grave finding with the line for the one that is turned, or for either."""
         role = self.wrong_one()
-        of_dvl, of_imu = (
-            f"`{name}.mounting.rpy_rad = {numbers(self.mounting(name).rpy_rad, 4)}`"
-            for name in ("dvl", "imu")
-        )
-        names = {"dvl": "the Doppler log is", "imu": "the IMU is"}
-        who = names.get(role, f"{EITHER}, is")
+        who = {"dvl": "the Doppler log", "imu": "the IMU"}.get(role, f"{EITHER},")
         lines = {
-            "dvl": f"{of_dvl} {IN_CALIBRATION}",
-            "imu": f"{of_imu} {IN_CALIBRATION}",
+            name: f"`{name}.mounting.rpy_rad = {numbers(self.rpy_rad(name), 4)}`"
+            for name in ("dvl", "imu")
         }
-        either = f"{of_dvl} {IN_CALIBRATION} or, if that mounting is sure, {of_imu}"
+        line = f"{lines[role or 'dvl']} {IN_CALIBRATION}"
+        if not role:
+            line += f" or, if that mounting is sure, {lines['imu']}"
         return contradiction(
             quantity.replace("DVL", "IMU") if role == "imu" else quantity,
-            f"{cause}: {who} turned on the vehicle, or its driver has other axes",
-            lines.get(role, either),
+            f"{cause}: {who} is turned on the vehicle, or its driver has other axes",
+            line,
             estimate,
             "°" if estimate.is_known else "",
         )

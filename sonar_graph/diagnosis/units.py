@@ -76,36 +76,29 @@ def coarse_findings(sequence: Sequence) -> list[Finding]:
     gyro_sigma = calibration.imu.gyro_noise_density / np.sqrt(max(interval_s, 1e-9))
     dvl_sigma = max(calibration.dvl.velocity_sigma_m_s)
     of_dvl = "`dvl.velocity_sigma_m_s = [{0:.2g}, {0:.2g}, {0:.2g}]`"
+    of_gyro = "`imu.gyro_bias_sigma = {0:.2g}`"
     rows = [
         ("DVL", "m/s", sequence.dvl.velocity, dvl_sigma, of_dvl),
-        (
-            "gyro",
-            "rad/s",
-            imu.angular_velocity,
-            gyro_sigma,
-            "`imu.gyro_bias_sigma = {0:.2g}`",
-        ),
+        ("gyro", "rad/s", imu.angular_velocity, gyro_sigma, of_gyro),
     ]
     if sequence.depth is not None:
-        depth_sigma = calibration.depth.sigma_m
-        of_depth = "`depth.sigma_m = {0:.2g}`"
         z_m = sequence.depth.z_m[:, None]
-        rows.append(("depth", "m", z_m, depth_sigma, of_depth))
+        of_depth = "`depth.sigma_m = {0:.2g}`"
+        rows.append(("depth", "m", z_m, calibration.depth.sigma_m, of_depth))
     found = list[Finding]()
     for name, unit, values, sigma, line in rows:
         step = coarse_step(values)
-        if step / 2 <= COARSE_SIGMAS * sigma:
-            continue
-        finding = contradiction(
-            f"{name}: resolution",
-            estimate=Estimate1D(step, 0.0),
-            unit=unit,
-            cause=f"values come in steps, most rows repeat, and the stated noise of {sigma:.2g} is far below: rounded or "
-            "cut by the driver",
-            consequence=f"an error of {step / 2:.2g} typically where they are cut",
-            line=f"record all digits, or state {line.format(step / 2)} {IN_CALIBRATION}",
-        )
-        found.append(finding)
+        if step / 2 > COARSE_SIGMAS * sigma:
+            finding = contradiction(
+                f"{name}: resolution",
+                f"values come in steps, most rows repeat, and the stated noise of {sigma:.2g} is far below: rounded or "
+                "cut by the driver",
+                f"record all digits, or state {line.format(step / 2)} {IN_CALIBRATION}",
+                Estimate1D(step, 0.0),
+                unit,
+                f"an error of {step / 2:.2g} typically where they are cut",
+            )
+            found.append(finding)
     return found
 
 
@@ -116,13 +109,12 @@ def coarse_step(values: Floats) -> float:
     coarsest = 0.0
     for column in steps.T:
         changes = column[column > 0]
-        if not FEWEST_CHANGES <= len(changes) < len(column) / 2:
-            continue
-        step = float(changes.min())
-        # noise of a sensor that stood still has no step in common
-        multiples = changes / step
-        if np.abs(multiples - np.round(multiples)).max() < STEP_TOLERANCE:
-            coarsest = max(coarsest, step)
+        if FEWEST_CHANGES <= len(changes) < len(column) / 2:
+            step = float(changes.min())
+            multiples = changes / step
+            # noise of a sensor that stood still has no step in common
+            if np.abs(multiples - np.round(multiples)).max() < STEP_TOLERANCE:
+                coarsest = max(coarsest, step)
     return coarsest
 
 
@@ -143,13 +135,8 @@ def velocity_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     line = f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
     if speed_m_s > FASTEST_M_S and unit != "mm/s":
         line += f"; mm/s if the vehicle moves at {speed_m_s * SPEEDS['mm/s']:.2g} m/s"
-    times = 1 / SPEEDS[unit]
-    yield contradiction(
-        DVL_UNIT,
-        f"velocities look {times:.0f} times too large ({why}): {unit}?",
-        line,
-        WRONG_UNIT,
-    )
+    cause = f"velocities look {1 / SPEEDS[unit]:.0f} times too large ({why}): {unit}?"
+    yield contradiction(DVL_UNIT, cause, line, WRONG_UNIT)
 
 
 def rate_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:

@@ -128,11 +128,9 @@ class Engine:
         self.calibration: Calibration | None = None
         """Known once the first seconds are over."""
         self.sequence: Sequence | None = None
-        """What the messages of these were."""
+        """What the messages of these were, with notes as `read_log` gives them."""
         self.log_time_ns = 0
         """Name of the newest message in the record."""
-        self.notes: dict[str, str] = {}
-        """Notes of these, as `read_log` gives them."""
         self.record_path = record.path
         self.generation = 0
         """Number of times that all steps began anew, since a topic of a further sensor came late."""
@@ -147,7 +145,7 @@ class Engine:
         self._record = record
         self._definition_of = definition_of
         self._config = self.options.config or LogConfig()
-        self._arrivals = self._no_arrivals()
+        self._arrivals = Arrivals(self.options.rate_hz, self.options.lateness_s)
         self._sonar: str | None = None
         """Frame of the sonar, once an image has come."""
         self._first: Held = []
@@ -165,17 +163,18 @@ class Engine:
     def take(self, message: Message) -> list[Part]:
         """Take in a message; the parts of it that count, at the end of the first seconds those of all until then."""
         name = message.topic
+        number = message.sequence
         is_new = name not in self.topics
         if is_new:
             self._add_topic(message)
         self.counts.received[name] += 1
-        if message.sequence:
+        if number:
             sender = (name, message.sender)
-            last = self._sequence.get(sender, message.sequence - 1)
-            self.counts.lost[name] += max(message.sequence - last - 1, 0)
-            self._sequence[sender] = max(message.sequence, last)
+            last = self._sequence.get(sender, number - 1)
+            self.counts.lost[name] += max(number - last - 1, 0)
+            self._sequence[sender] = max(number, last)
         at_ns = self.log_time_ns = self._record.write(
-            name, message.payload, message.arrival_ns, message.sequence, message.sent_ns
+            name, message.payload, message.arrival_ns, number, message.sent_ns
         )
         # of a sensor that began late
         if is_new and self._reader is not None:
@@ -217,9 +216,6 @@ class Engine:
         """Name a message in the record as not used."""
         self.counts.dropped[topic, reason] += 1
         self._record.drop(topic, log_time_ns, reason, arrival_ns)
-
-    def _no_arrivals(self) -> Arrivals:
-        return Arrivals(self.options.rate_hz, self.options.lateness_s)
 
     def _add_topic(self, message: Message) -> None:
         kind = message.type_name
@@ -317,10 +313,7 @@ class Engine:
         except LogError as error:  # several topics fit
             if self.options.topics.keys() - ROLES.keys():
                 raise
-            again = (
-                "everything is recorded: end with Ctrl-C, and begin again with a choice"
-            )
-            self.waits_for = f"{error}; {again}"
+            self.waits_for = f"{error}; everything is recorded: end with Ctrl-C, and begin again with a choice"
             return False
         # detections that break their own rules would make the topic useless
         detections = choices["detections"]
@@ -335,7 +328,8 @@ class Engine:
             self._sonar = sonar or self._sonar
             dvl: Any = choices["dvl"].adapter
             choices["dvl"] = replace(choices["dvl"], adapter=dvl.at_first())
-            assembly = self._assembly(recording, choices)
+            given = self.options.calibration
+            assembly = Assembly(recording, choices, given, self._sonar)
             # a sensor of no use may become one later
             for role, choice in choices.items():
                 if not _is_of_use(assembly, role):
@@ -345,7 +339,8 @@ class Engine:
             plain = json.loads(json.dumps(tables))
             config = LogConfig.parse(plain, self._config.source)
             # by the pinned configuration, as single messages are read from now on
-            assembly = self._assembly(recording, choose_topics(recording, {}, config))
+            as_read = choose_topics(recording, {}, config)
+            assembly = Assembly(recording, as_read, given, self._sonar)
             sequence = assembly.sequence("live")
             reader = MessageReader(assembly)
         except SonarGraphError as error:
@@ -357,26 +352,17 @@ class Engine:
         self._reader = reader
         self.sequence = sequence
         self.calibration = sequence.calibration
-        self.notes = sequence.notes
-        trees = [
-            at_ns for message, at_ns in held if message.topic.endswith("tf_static")
-        ]
+        trees = (at for message, at in held if message.topic.endswith("tf_static"))
         said = {
             LIVE_RATE: repr(float(self.options.rate_hz)),
             LATENESS: repr(float(self.options.lateness_s)),
         }
-        name = self.record_path.stem
-        newest_ns = max(trees, default=0)
-        self._record.describe(name, self.calibration, tables, said, newest_ns)
-        self._arrivals = self._no_arrivals()
+        about = (self.record_path.stem, self.calibration, tables, said)
+        self._record.describe(*about, max(trees, default=0))
+        self._arrivals = Arrivals(self.options.rate_hz, self.options.lateness_s)
         self.in_use = {role: c.topic for role, c in choices.items() if c.topic}
         self._find_places()
         return True
-
-    def _assembly(
-        self, recording: Recording, choices: Mapping[str, Choice]
-    ) -> Assembly:
-        return Assembly(recording, choices, self.options.calibration, self._sonar)
 
     def _recording(self, held: Held) -> Recording:
         topics = {name: topic.empty() for name, topic in self.topics.items()}
@@ -387,8 +373,9 @@ class Engine:
     def _all_parts(self, held: Held) -> list[Part]:
         """Parts of all messages until now, after the usual difference of their stamps from their arrival is known."""
         assert self._reader is not None
+        read = self._reader.read
         found = [
-            (message, at_ns, self._reader.read(message.topic, message.payload, at_ns))
+            (message, at_ns, read(message.topic, message.payload, at_ns))
             for message, at_ns in held
         ]
         first_ns = held[0][0].arrival_ns if held else 0

@@ -7,6 +7,8 @@ from collections import Counter, deque
 
 from sonar_graph.live.live_messages import Message
 
+MOST_BYTES = 1 << 28
+"""Of the messages that wait."""
 SILENT_S = 5.0
 """Time without a message after which the user is told."""
 
@@ -14,11 +16,10 @@ SILENT_S = 5.0
 class Inbox:
     """Messages that wait to be taken, bounded: the oldest are dropped and counted."""
 
-    def __init__(self, most_bytes: int = 1 << 28) -> None:
+    def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
         self._messages: deque[Message] = deque()
         self._bytes = 0
-        self._most_bytes = most_bytes
         self._changed = threading.Condition()
 
     def put(self, message: Message) -> None:
@@ -27,7 +28,7 @@ class Inbox:
             self._messages.append(message)
             self._bytes += len(message.payload)
             # an estimator that hangs must not take all memory
-            while self._bytes > self._most_bytes:
+            while self._bytes > MOST_BYTES:
                 oldest = self._messages.popleft()
                 self._bytes -= len(oldest.payload)
                 self.dropped[oldest.topic] += 1

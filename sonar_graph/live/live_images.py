@@ -47,13 +47,11 @@ class LiveImages:
     """
 
     def __init__(self, engine: Engine) -> None:
-        topics = engine.options.topics
         self._engine = engine
-        self._wanted = {SONAR: topics[SONAR]} if SONAR in topics else {}
         self._topic = ""
         self._adapter: SonarAdapter | None = None
         self._seen: deque[SonarAnswer] = deque()
-        self._is_off = "detections" in topics
+        self._is_off = "detections" in engine.options.topics
         self._worker = None if self._is_off else SonarWorker(self._seen.append)
         self.waiting = 0
         """Number of images that the recogniser has and has not answered, with the one that it begins with."""
@@ -100,14 +98,13 @@ class LiveImages:
                 break
             self._images.popleft()
             rows = {
-                role: joined(rows) if rows else None
-                for role, rows in self._rows.items()
+                role: joined(blocks) for role, blocks in self._rows.items() if blocks
             }
             self._rows = {role: [] for role in ROLES}
             waiting = Waiting(topic, at_ns, SonarRows(**rows, frame=frame))
-            dropped = self._worker.add(waiting)
-            self.waiting += 1 - len(dropped)
-            for one in dropped:
+            self.waiting += 1
+            for one in self._worker.add(waiting):
+                self.waiting -= 1
                 at = (one.topic, one.log_time_ns)
                 self._engine.drop(*at, OVERTAKEN, message.arrival_ns)
 
@@ -160,7 +157,9 @@ class LiveImages:
         self._known = set(engine.topics)
         recording = Recording(engine.record_path, engine.topics)
         config = engine.options.config or LogConfig()
-        choice = choose_topics(recording, self._wanted, config, (SONAR,))[SONAR]
+        chosen = engine.options.topics.items()
+        wanted = {role: topic for role, topic in chosen if role == SONAR}
+        choice = choose_topics(recording, wanted, config, (SONAR,))[SONAR]
         if choice.topic is None or not isinstance(choice.adapter, SonarAdapter):
             return
         self._topic = choice.topic

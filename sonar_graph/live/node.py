@@ -101,7 +101,8 @@ class LiveRun:
         self._now = Status()
         self._types = wanted_types(options.config or LogConfig(), ROLES)
         self._unused: set[str] = set()
-        self._faulty: set[str] = set()
+        self._told: set[str] = set()
+        """What is told once."""
         self._forms = PoseForms()
         self._answers: deque[Answer] = deque()
         # compiles in its process meanwhile
@@ -117,13 +118,9 @@ class LiveRun:
         warm_predictor(warm_up)
         self._predictor: Predictor | None = None
         self._silence = Silence()
-        self._is_failed = False
         self._generation = -1
         self._done_s: dict[str, float] = {}
         """When each thing that is done now and then was done last."""
-        self._withheld: list[str] = []
-        self._is_located = False
-        self._told_of_map: set[str] = set()
         self._estimates = 0
         self._next_frame_ns = 0
         self._latency_ns = 0
@@ -181,7 +178,8 @@ class LiveRun:
         # each message gives the steps that it completes; the rest of many comes now
         if not messages:
             self._give_steps()
-        self._use_answers()
+        while self._answers:
+            self._use(self._answers.popleft())
         if failure := self._images.failure():
             self._said(failure)
         for stamp_ns, detections in self._images.recognised():
@@ -201,9 +199,8 @@ class LiveRun:
             motion = {self.engine.in_use[role] for role in MOTION if self.engine.in_use}
             for line in self._silence.lines(motion, time.monotonic()):
                 self._said(line)
-        if self._worker.error is not None and not self._is_failed:
-            self._is_failed = True
-            self._said(f"{self._failure()}; everything is still recorded")
+        if self._worker.error is not None:
+            self._say_once("failed", f"{self._failure()}; everything is still recorded")
 
     def _elapsed_s(self, what: str, period_s: float) -> float:
         """Seconds since something was done last, where it is to be done again after a period; else 0."""
@@ -289,11 +286,13 @@ class LiveRun:
 
     def _fault(self, what: str, error: Exception) -> None:
         """Report once what went wrong with a topic, and go on."""
-        if what not in self._faulty:
-            self._faulty.add(what)
-            self._said(
-                f"{what}: {type(error).__name__}: {error}; everything is still recorded"
-            )
+        fault = f"{type(error).__name__}: {error}"
+        self._say_once(what, f"{what}: {fault}; everything is still recorded")
+
+    def _say_once(self, what: str, line: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            self._said(line)
 
     def _begin(self) -> None:
         assert self.engine.calibration is not None
@@ -302,7 +301,8 @@ class LiveRun:
             self._said(
                 "a further sensor has come: estimating anew from the beginning of the record"
             )
-        notes = self.engine.notes
+        assert self.engine.sequence is not None
+        notes = self.engine.sequence.notes
         for subject in ("topics", "calibration", "start"):
             if text := notes.get(f"log.{subject}"):
                 self._said(shorten(f"{subject}: {text}", LINE_WIDTH))
@@ -332,20 +332,16 @@ class LiveRun:
             self._put("/tf", self._forms.body(at))
         self._latency_ns = max(self._latency_ns, time.time_ns() - arrival_ns)
 
-    def _use_answers(self) -> None:
-        while self._answers:
-            self._use(self._answers.popleft())
-
     def _use(self, answer: Answer) -> None:
         assert self._predictor is not None
-        self._withheld = answer.withheld
-        self._now.withheld = tuple(answer.withheld)
+        self._now.withheld = answer.withheld
         self._tell_of_map(answer)
         self._longest_update_s = max(self._longest_update_s, answer.update_s)
         self._estimates += len(answer.estimates)
         self._now.estimates += len(answer.estimates)
-        if answer.landmarks is not None:
-            self._now.landmarks = len(answer.landmarks)
+        mapped = answer.landmarks
+        if mapped is not None:
+            self._now.landmarks = len(mapped)
         for estimate in answer.estimates:
             self._put("/sonar_graph/pose", self._forms.estimate(estimate))
         if not answer.estimates:
@@ -354,24 +350,20 @@ class LiveRun:
         self._predictor.correct(newest)
         map_T_odom = self._predictor.map_T_odom
         self._put("/tf", self._forms.correction(newest.stamp_ns, map_T_odom))
-        if answer.landmarks is not None and len(answer.landmarks):
-            landmarks, markers = payloads_of_map(answer.landmarks, newest.stamp_ns)
+        if mapped is not None and len(mapped):
+            landmarks, markers = payloads_of_map(mapped, newest.stamp_ns)
             self._put("/sonar_graph/landmarks", landmarks)
             self._put("/sonar_graph/markers", markers)
 
     def _tell_of_map(self, answer: Answer) -> None:
         """Say once where the vehicle was located in its map, and what moved in it."""
         assert self.engine.calibration is not None
-        news = [m for m in answer.withheld if m.startswith((LOCATED_AGAIN, MOVED))]
-        is_found = self.engine.calibration.start.source == "map"
-        if is_found and answer.estimates and not self._is_located:
-            self._is_located = True
+        for message in answer.withheld:
+            if message.startswith((LOCATED_AGAIN, MOVED)):
+                self._say_once(message, message)
+        if self.engine.calibration.start.source == "map" and answer.estimates:
             x, y, _ = answer.estimates[0].world_T_body.translation()
-            news.append(f"located in the map at ({x:.2f}, {y:.2f}) m")
-        for message in news:
-            if message not in self._told_of_map:
-                self._told_of_map.add(message)
-                self._said(message)
+            self._say_once("located", f"located in the map at ({x:.2f}, {y:.2f}) m")
 
     def _state(self, period_s: float) -> None:
         """Publish the state of the seconds since the last one, and give its line to the user."""
@@ -382,7 +374,7 @@ class LiveRun:
             "dropped": ", ".join(
                 f"{name} {n} {why}" for (name, why), n in sorted(dropped.items())
             ),
-            "withheld": "; ".join(self._withheld),
+            "withheld": "; ".join(self._now.withheld),
         }
         values = {
             "latency_ms": f"{self._latency_ns * 1e-6:.1f}",
@@ -397,21 +389,18 @@ class LiveRun:
         summary = "running" if is_well else "messages are lost, dropped or withheld"
         state = payload_of_state(self._now.newest_ns, is_well, summary, values)
         self._put("/sonar_graph/state", state)
-        if self._status is not None:
-            gone = dropped.total() + sum(lost.values())
-            latency_ms = self._latency_ns * 1e-6
-            line = self._now.line(
-                dropped=gone, latency_ms=latency_ms, period_s=period_s
-            )
-            # after the end of a log there is none
-            if line:
-                self._status(line)
+        gone = dropped.total() + sum(lost.values())
+        latency_ms = self._latency_ns * 1e-6
+        line = self._now.line(dropped=gone, latency_ms=latency_ms, period_s=period_s)
+        # after the end of a log there is none
+        if line and self._status is not None:
+            self._status(line)
         self._latency_ns = 0
         self._longest_update_s = 0.0
 
     def _put(self, topic: str, payload: bytes) -> None:
-        for outlet in self._outlets:
-            outlet.put(topic, payload)
+        for put in self._outlets:
+            put(topic, payload)
 
 
 def warm_predictor(world: Sequence) -> None:

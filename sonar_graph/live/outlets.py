@@ -13,10 +13,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from struct import Struct
-from typing import Any, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -55,11 +55,8 @@ COLOUR = (0.12, 0.47, 0.71, 0.9)
 TEXT_HEIGHT_M = 0.15
 
 
-class Outlet(Protocol):
-    """Something that sends messages of the topics in `TOPICS`."""
-
-    def put(self, topic: str, payload: bytes) -> None:
-        """Send one message."""
+Outlet = Callable[[str, bytes], None]
+"""Sends one message of the topics in `TOPICS`."""
 
 
 class Form:
@@ -161,12 +158,9 @@ def payload_of_detections(
 
 def payloads_of_map(landmarks: LandmarkMap, stamp_ns: int) -> tuple[bytes, bytes]:
     """``LandmarkMap`` and ``MarkerArray`` of a map."""
-    messages = (
-        landmark_map_message("", landmarks, stamp_ns),
-        landmark_markers("", landmarks, stamp_ns, COLOUR, TEXT_HEIGHT_M),
-    )
-    in_map, markers = (message.payloads[0].tobytes() for message in messages)
-    return in_map, markers
+    in_map = landmark_map_message("", landmarks, stamp_ns)
+    markers = landmark_markers("", landmarks, stamp_ns, COLOUR, TEXT_HEIGHT_M)
+    return in_map.payloads[0].tobytes(), markers.payloads[0].tobytes()
 
 
 def payload_of_state(
@@ -206,7 +200,7 @@ class Status:
     landmarks: int = 0
     detected_ns: int = 0
     """Stamp of the newest frame with a detection; 0: none has come."""
-    withheld: tuple[str, ...] = ()
+    withheld: Collection[str] = ()
     """What the estimator could not use, in its own words."""
     last: str = ""
     """The line before."""
@@ -253,50 +247,41 @@ class Status:
         return " | ".join(parts)
 
 
-class ZenohOutlet:
+def zenoh_outlet(session: Any, domain: int) -> Outlet:
     """Topics of ROS 2 over zenoh."""
-
-    def __init__(self, session: Any, domain: int) -> None:
-        self._publishers = {
-            topic: Publisher(session, domain, topic, kind, may_drop=True)
-            for topic, kind in TOPICS.items()
-        }
-
-    def put(self, topic: str, payload: bytes) -> None:
-        """Send one message."""
-        self._publishers[topic].put(payload)
+    publishers = {
+        topic: Publisher(session, domain, topic, kind, may_drop=True)
+        for topic, kind in TOPICS.items()
+    }
+    return lambda topic, payload: publishers[topic].put(payload)
 
 
-class FoxgloveOutlet:
+def foxglove_outlet(port: int) -> Outlet:
     """Server for Foxglove and Lichtblick, on the loopback only."""
+    try:
+        import foxglove
+    except ImportError as error:
+        raise LogError(
+            "--foxglove needs foxglove-sdk: pip install 'sonar-graph[live]'"
+        ) from error
+    try:
+        server = foxglove.start_server(name="sonar-graph", host="127.0.0.1", port=port)
+    except RuntimeError as error:
+        raise LogError(
+            f"--foxglove {port}: cannot listen on 127.0.0.1:{port}: {error}; name another port"
+        ) from error
+    channels = {}
+    for topic, kind in TOPICS.items():
+        data = definition(kind).encode()
+        schema = foxglove.Schema(name=kind, encoding="ros2msg", data=data)
+        channel = foxglove.Channel(topic, schema=schema, message_encoding="cdr")
+        channels[topic] = channel
 
-    def __init__(self, port: int) -> None:
-        try:
-            import foxglove
-        except ImportError as error:
-            raise LogError(
-                "--foxglove needs foxglove-sdk: pip install 'sonar-graph[live]'"
-            ) from error
-        try:
-            self._server = foxglove.start_server(
-                name="sonar-graph", host="127.0.0.1", port=port
-            )
-        except RuntimeError as error:
-            raise LogError(
-                f"--foxglove {port}: cannot listen on 127.0.0.1:{port}: {error}; name another port"
-            ) from error
-        self._channels = {}
-        for topic, kind in TOPICS.items():
-            schema = foxglove.Schema(
-                name=kind, encoding="ros2msg", data=definition(kind).encode()
-            )
-            self._channels[topic] = foxglove.Channel(
-                topic, schema=schema, message_encoding="cdr"
-            )
+    def put(topic: str, payload: bytes, _server: object = server) -> None:
+        # the server lives as long as this function
+        channels[topic].log(payload)
 
-    def put(self, topic: str, payload: bytes) -> None:
-        """Send one message."""
-        self._channels[topic].log(payload)
+    return put
 
 
 Link = ZenohLink | FoxgloveLink
@@ -315,9 +300,9 @@ def open_link(endpoints: list[str], domain: int) -> Link:
 def open_outlets(link: Link, foxglove_port: int | None) -> list[Outlet]:
     """Outlets over zenoh, if that is the link, and, with a port, for viewers."""
     # a foxglove_bridge takes no messages back
-    outlets: list[Outlet] = (
-        [ZenohOutlet(link.session, link.domain)] if isinstance(link, ZenohLink) else []
-    )
+    outlets = list[Outlet]()
+    if isinstance(link, ZenohLink):
+        outlets.append(zenoh_outlet(link.session, link.domain))
     if foxglove_port is not None:
-        outlets.append(FoxgloveOutlet(foxglove_port))
+        outlets.append(foxglove_outlet(foxglove_port))
     return outlets

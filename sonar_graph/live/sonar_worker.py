@@ -39,10 +39,10 @@ class SonarBegin(NamedTuple):
 class SonarRows:
     """Rows since the last request, and an image after them."""
 
-    imu: Imu | None
-    dvl: Dvl | None
-    depth: Depth | None
     frame: SonarFrames | None
+    imu: Imu | None = None
+    dvl: Dvl | None = None
+    depth: Depth | None = None
 
 
 class SonarAnswer(NamedTuple):
@@ -90,7 +90,7 @@ def serve_recogniser() -> None:
     serve(_answer)
 
 
-def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
+def _answer(request: Any, _: Tell) -> object:
     if request == WARM_UP:
         warm_recogniser()
         return READY

@@ -92,16 +92,15 @@ def serve_estimator() -> None:
     serve(_answer)
 
 
-def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
+def _answer(request: Any, _: Tell) -> object:
     if isinstance(request, Begin):
         # loads numba, which the process that serves a robot has loaded already
         from sonar_graph.navigation import make_estimator
 
         kind = load_estimator(request.name)
         params = make_params(kind, request.overrides, request.name)
-        _Served.estimator = make_estimator(
-            partial(kind, params=params), request.calibration
-        )
+        make = partial(kind, params=params)
+        _Served.estimator = make_estimator(make, request.calibration)
         _Served.estimates = []
         _Served.update_s = []
         _Served.next_map_s = 0.0
@@ -125,12 +124,11 @@ def _answer(request: Any, tell: Tell) -> object:  # noqa: ARG001  # of `serve`
     update_s = []
     # each update is timed by itself, although steps come together
     for step in request:
-        estimate = estimator.process(step)
+        if (estimate := estimator.process(step)) is not None:
+            found.append(estimate)
         after_s = time.perf_counter()
         update_s.append(after_s - before_s)
         before_s = after_s
-        if estimate is not None:
-            found.append(estimate)
     _Served.update_s += update_s
     _Served.estimates += found
     landmarks_now = None
@@ -177,7 +175,6 @@ class Worker:
         self._is_catching_up = False
         self._changed = threading.Condition()
         self._is_done = False
-        self.is_busy = False
         self.error: Exception | None = None
         """Why the estimator failed, if it did."""
         self._process.answer()  # that it is ready
@@ -239,7 +236,6 @@ class Worker:
         try:
             while True:
                 with self._changed:
-                    self.is_busy = False
                     self._changed.wait_for(
                         lambda: self._waiting or self._begins or self._is_done
                     )
@@ -247,7 +243,6 @@ class Worker:
                     self._begins = None
                     steps = self._waiting[:MOST_AT_ONCE]
                     del self._waiting[:MOST_AT_ONCE]
-                    self.is_busy = True
                 # a run that begins again forgets the steps of the one before
                 if begin is not None:
                     self._ask(begin)

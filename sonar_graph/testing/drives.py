@@ -63,35 +63,24 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
     (20.0, 1001, 101, array([ 4,  9, 11]))
     """
     noise = np.random.default_rng(SEED)
-    x, y, z = (
-        _circle(np.array([START_NS + round(dvl_delay_s * NS_PER_S)], dtype=np.int64))
-        .positions[0]
-        .tolist()
-    )
-    start = Start(
-        position_m=(x, y, z), rpy_rad=(0.0, 0.0, YAW_RATE_RAD_S * dvl_delay_s)
-    )
+    begin_ns = START_NS + round(dvl_delay_s * NS_PER_S)
+    x, y, z = _circle(np.array([begin_ns])).positions[0].tolist()
+    yaw_rad = YAW_RATE_RAD_S * dvl_delay_s
+    start = Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, yaw_rad))
     calibration = Calibration(start=start, imu=ImuCalibration(gyro_bias_sigma=1e-5))
     imu = _turning_imu(calibration, noise)
     dvl_ns = _stamps(dvl_delay_s, DVL_HZ, DURATION_S)
     depth_ns = _stamps(0, DEPTH_HZ, DURATION_S)
-    n = len(dvl_ns)
-    m = len(depth_ns)
-    velocity = np.array(
-        [SPEED_M_S, 0.0, 0.0]
-    ) + calibration.dvl.velocity_sigma_m_s * noise.standard_normal((n, 3))
-    dvl = Dvl(dvl_ns, velocity, np.full((n, 3, 3), np.nan))
-    depth = Depth(
-        depth_ns,
-        HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(m),
-        np.full(m, np.nan),
-    )
+    velocity_sigma = np.array(calibration.dvl.velocity_sigma_m_s)
+    velocity = velocity_sigma * noise.standard_normal((len(dvl_ns), 3))
+    velocity += [SPEED_M_S, 0.0, 0.0]
+    z_m = HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(len(depth_ns))
     return Sequence(
         name="left turn",
         calibration=calibration,
         imu=imu,
-        dvl=dvl,
-        depth=depth,
+        dvl=Dvl(dvl_ns, velocity, _unstated(len(dvl_ns), 3, 3)),
+        depth=Depth(depth_ns, z_m, _unstated(len(depth_ns))),
         detections=_detections(calibration, noise),
         truth=_circle(_stamps(0, IMU_HZ, DURATION_S)),
         true_landmarks=_true_landmarks(),
@@ -110,38 +99,27 @@ def aided_world() -> Sequence:
     """
     world = small_world()
     noise = np.random.default_rng(SEED)
-    calibration = world.calibration.model_copy(
-        update={
-            "positions": PositionCalibration(
-                sigma_m=(0.5, 0.5, 1.0), antenna_m=(-0.4, 0.2, 0.6)
-            )
-        }
-    )
+    gnss = PositionCalibration(sigma_m=(0.5, 0.5, 1.0), antenna_m=(-0.4, 0.2, 0.6))
     # not at the stamps of other sensors
     heading_ns = _stamps(0, HEADING_HZ, DURATION_S) + NS_PER_S // 7
     fixes_ns = _stamps(0, FIX_HZ, DURATION_S)
-    m = len(heading_ns)
-    n = len(fixes_ns)
-    yaw_rad = YAW_RATE_RAD_S * (
-        heading_ns - START_NS
-    ) * 1e-9 + calibration.heading.sigma_rad * noise.standard_normal(m)
+    sigma_rad = world.calibration.heading.sigma_rad
+    white_rad = sigma_rad * noise.standard_normal(len(heading_ns))
+    yaw_rad = YAW_RATE_RAD_S * (heading_ns - START_NS) * 1e-9 + white_rad
+    sigmas_rad = _unstated(len(heading_ns))
+    sigmas_rad[1::2] = sigma_rad
     body = _circle(fixes_ns)
     # fixes are of the antenna, not of the body
-    antenna = body.positions + body.rotations().apply(calibration.positions.antenna_m)
-    fixes = antenna + calibration.positions.sigma_m * noise.standard_normal((n, 3))
-    covs = np.tile(np.diag(np.square(calibration.positions.sigma_m)), (n, 1, 1))
+    antenna = body.positions + body.rotations().apply(gnss.antenna_m)
+    fixes = antenna + gnss.sigma_m * noise.standard_normal((len(fixes_ns), 3))
+    covs = _unstated(len(fixes_ns), 3, 3)
+    covs[1::2] = np.diag(np.square(gnss.sigma_m))
     return replace(
         world,
         name="left turn with heading and fixes",
-        calibration=calibration,
-        heading=Heading(
-            heading_ns,
-            yaw_rad,
-            np.where(np.arange(m) % 2, calibration.heading.sigma_rad, np.nan),
-        ),
-        positions=PositionFixes(
-            fixes_ns, fixes, np.where((np.arange(n) % 2)[:, None, None], covs, np.nan)
-        ),
+        calibration=world.calibration.model_copy(update={"positions": gnss}),
+        heading=Heading(heading_ns, yaw_rad, sigmas_rad),
+        positions=PositionFixes(fixes_ns, fixes, covs),
     )
 
 
@@ -168,16 +146,16 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
     # a new track for each landmark every few frames
     track = frame // TRACK_FRAMES * len(LANDMARKS_M) + place
     named = noise.choice(["right", "wrong", "nothing"], len(rows), p=[0.7, 0.2, 0.1])
-    named = np.where(
-        frame < MISNAMED_FRAMES, "wrong", named[track] if is_tracked else named
-    )
+    if is_tracked:
+        named = named[track]
+    named[frame < MISNAMED_FRAMES] = "wrong"
     names = np.array(list(LANDMARKS_M), dtype=np.int64)
     # the next landmark: wrong, but one that exists
     wrong = names[(place + 1) % len(names)]
     ids = np.select([named == "wrong", named == "nothing"], [wrong, -1], names[place])
-    misnamed = replace(
-        rows, candidate_ids=ids[:, None], track=track if is_tracked else rows.track
-    )
+    misnamed = replace(rows, candidate_ids=ids[:, None])
+    if is_tracked:
+        misnamed = replace(misnamed, track=track)
     return replace(world, detections=misnamed)
 
 
@@ -195,37 +173,35 @@ def still_world() -> Sequence:
     imu_stamps = _stamps(0, IMU_HZ, STILL_S)
     slow_stamps = _stamps(0, DVL_HZ, STILL_S)
     # at rest the accelerometers measure the reaction to gravity, upwards
-    up_in_body = (
-        Rotation.from_euler("xyz", STILL_START.rpy_rad)
-        .inv()
-        .apply([0.0, 0.0, calibration.gravity_m_s2])
-    )
+    body_R_world = Rotation.from_euler("xyz", STILL_START.rpy_rad).inv()
+    up_in_body = body_R_world.apply([0.0, 0.0, calibration.gravity_m_s2])
+    m = len(imu_stamps)
     n = len(slow_stamps)
     return Sequence(
         name="at rest",
         calibration=calibration,
-        imu=Imu(
-            imu_stamps,
-            np.zeros((len(imu_stamps), 3)),
-            np.tile(up_in_body, (len(imu_stamps), 1)),
-        ),
-        dvl=Dvl(slow_stamps, np.zeros((n, 3)), np.full((n, 3, 3), np.nan)),
-        depth=Depth(slow_stamps, np.full(n, HEIGHT_M), np.full(n, np.nan)),
+        imu=Imu(imu_stamps, np.zeros((m, 3)), np.tile(up_in_body, (m, 1))),
+        dvl=Dvl(slow_stamps, np.zeros((n, 3)), _unstated(n, 3, 3)),
+        depth=Depth(slow_stamps, np.full(n, HEIGHT_M), _unstated(n)),
     )
+
+
+def _unstated(*shape: int) -> Floats:
+    """Uncertainties of rows that state none."""
+    return np.full(shape, np.nan)
 
 
 def every_stamp(sequence: Sequence) -> Ints:
     """Stamps of all measurements after the start until the end, shape (n,)."""
-    stamps_ns = np.unique(
-        np.concatenate([block.stamps_ns for block in sequence.blocks().values()])
-    )
+    stamps = [block.stamps_ns for block in sequence.blocks().values()]
+    stamps_ns = np.unique(np.concatenate(stamps))
     return stamps_ns[(stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)]
 
 
 def _stamps(first_s: float, rate_hz: int, until_s: int) -> Ints:
-    return START_NS + np.arange(
-        round(first_s * rate_hz), until_s * rate_hz + 1, dtype=np.int64
-    ) * (NS_PER_S // rate_hz)
+    first = round(first_s * rate_hz)
+    number = np.arange(first, until_s * rate_hz + 1, dtype=np.int64)
+    return START_NS + number * (NS_PER_S // rate_hz)
 
 
 def _circle(stamps_ns: Ints) -> Trajectory:
@@ -250,9 +226,7 @@ def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
     force = np.array([0.0, SPEED_M_S * YAW_RATE_RAD_S, calibration.gravity_m_s2])
     rate_sigma = calibration.imu.gyro_noise_density * root_hz
     force_sigma = calibration.imu.accel_noise_density * root_hz
-    rates = np.array([0.0, 0.0, YAW_RATE_RAD_S]) + rate_sigma * noise.standard_normal(
-        shape
-    )
+    rates = rate_sigma * noise.standard_normal(shape) + [0.0, 0.0, YAW_RATE_RAD_S]
     return Imu(stamps_ns, rates, force + force_sigma * noise.standard_normal(shape))
 
 
@@ -270,23 +244,20 @@ def _detections(
     here = np.repeat(body.positions, len(LANDMARKS_M), axis=0)
     facing = np.repeat(body.quaternions_xyzw, 3, axis=0)
     seen: Floats = Rotation.from_quat(facing).inv().apply(there - here)
-    ids = np.tile(np.array(list(LANDMARKS_M), dtype=np.int64), len(frames_ns))[:, None]
+    sonar = calibration.sonar
+    range_m = np.linalg.norm(seen, axis=1)
+    range_m += sonar.range_sigma_m * noise.standard_normal(n)
+    azimuth_rad = np.arctan2(seen[:, 1], seen[:, 0])
+    azimuth_rad += sonar.azimuth_sigma_rad * noise.standard_normal(n)
+    ids = np.tile(_true_landmarks().ids, len(frames_ns))[:, None]
+    probability = np.where(np.arange(n) % 10 == 9, 0.05, 0.99)[:, None]
+    unstated = _unstated(n, 2, 2)
     return LandmarkDetections(
-        stamps_ns,
-        np.linalg.norm(seen, axis=1)
-        + calibration.sonar.range_sigma_m * noise.standard_normal(n),
-        np.arctan2(seen[:, 1], seen[:, 0])
-        + calibration.sonar.azimuth_sigma_rad * noise.standard_normal(n),
-        np.full((n, 2, 2), np.nan),
-        ids,
-        np.where(np.arange(n) % 10 == 9, 0.05, 0.99)[:, None],
+        stamps_ns, range_m, azimuth_rad, unstated, ids, probability
     )
 
 
 def _true_landmarks() -> LandmarkMap:
+    ids = np.array(list(LANDMARKS_M), dtype=np.int64)
     positions = np.array([(x, y, HEIGHT_M) for x, y in LANDMARKS_M.values()])
-    return LandmarkMap(
-        np.array(list(LANDMARKS_M), dtype=np.int64),
-        positions,
-        np.full((len(positions), 3, 3), np.nan),
-    )
+    return LandmarkMap(ids, positions, _unstated(len(ids), 3, 3))

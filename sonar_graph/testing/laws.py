@@ -21,8 +21,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EstimatorError
@@ -79,12 +79,14 @@ class EstimatorRun:
     landmarks: LandmarkMap
     detections: DetectionLog
 
-    def causal(self, stamps_ns: list[int]) -> Trajectory:
-        """Causal estimates at some of the instants."""
-        wanted = set(stamps_ns)
-        return Trajectory.from_estimates(
-            [e for e in self.estimates if e.stamp_ns in wanted]
-        )
+    def results(self) -> dict[str, Any]:
+        """All results by their names."""
+        return {
+            "causal estimates": Trajectory.from_estimates(self.estimates),
+            "trajectory()": self.trajectory,
+            "landmarks()": self.landmarks,
+            "detections()": self.detections,
+        }
 
 
 def fresh(make: MakeEstimator, calibration: Calibration) -> Estimator:
@@ -142,17 +144,9 @@ def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorR
 
 def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
     """Names of the results that differ in any bit."""
-    parts: dict[str, tuple[object, object]] = {
-        "causal estimates": (
-            Trajectory.from_estimates(one.estimates),
-            Trajectory.from_estimates(other.estimates),
-        ),
-        "trajectory()": (one.trajectory, other.trajectory),
-        "landmarks()": (one.landmarks, other.landmarks),
-        "detections()": (one.detections, other.detections),
-    }
+    theirs = other.results()
     return [
-        name for name, (mine, theirs) in parts.items() if not _is_same(mine, theirs)
+        name for name, mine in one.results().items() if not _is_same(mine, theirs[name])
     ]
 
 
@@ -199,21 +193,17 @@ def deviation(one: EstimatorRun, other: EstimatorRun) -> tuple[float, float]:
     # in units of standard deviations: metres and radians compare
     sigmas = np.sqrt(np.einsum("nii->ni", mine.covariances))
     products = np.einsum("ni,nj->nij", sigmas, sigmas)
-    return (
-        float(np.max(np.abs(_perturbation(mine, theirs)) / sigmas, initial=0.0)),
-        float(
-            np.max(
-                np.abs(mine.covariances - theirs.covariances) / products, initial=0.0
-            )
-        ),
-    )
+    of_poses = np.abs(_perturbation(mine, theirs)) / sigmas
+    of_covs = np.abs(mine.covariances - theirs.covariances) / products
+    return float(np.max(of_poses, initial=0.0)), float(np.max(of_covs, initial=0.0))
 
 
 def _at_same_instants(
     one: EstimatorRun, other: EstimatorRun
 ) -> tuple[Trajectory, Trajectory]:
-    stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
-    return one.causal(stamps_ns), other.causal(stamps_ns)
+    wanted = {estimate.stamp_ns for estimate in one.estimates}
+    theirs = [estimate for estimate in other.estimates if estimate.stamp_ns in wanted]
+    return Trajectory.from_estimates(one.estimates), Trajectory.from_estimates(theirs)
 
 
 def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
@@ -222,12 +212,8 @@ def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
         return np.empty((0, 6))
     # perturbations are in the body frame, as covariances are
     into_body = mine.rotations().inv()
-    return np.hstack(
-        [
-            (into_body * theirs.rotations()).as_rotvec(),
-            into_body.apply(theirs.positions - mine.positions),
-        ]
-    )
+    turn = (into_body * theirs.rotations()).as_rotvec()
+    return np.hstack([turn, into_body.apply(theirs.positions - mine.positions)])
 
 
 def require(kept: bool, violation: str) -> None:
@@ -349,12 +335,8 @@ def frames_and_signs_are_those_of_the_vocabulary(make: MakeEstimator) -> None:
         # an estimator may map none of them
         known = np.isin(world.true_landmarks.ids, outcome.landmarks.ids)
         if known.any():
-            off_m = np.linalg.norm(
-                (outcome.landmarks.positions - world.true_landmarks.positions[known])[
-                    :, :2
-                ],
-                axis=1,
-            )
+            true = world.true_landmarks.positions[known]
+            off_m = np.hypot(*(outcome.landmarks.positions - true)[:, :2].T)
             require(
                 off_m.max() < 0.5,
                 f"{world.name}: a landmark is {off_m.max():.2f} m from the truth, horizontally",
@@ -460,14 +442,10 @@ def input_stays_as_it_was(make: MakeEstimator) -> None:
     # the same world, made again
     untouched = aided_world()
     run(make, world)
-    for block, before in zip(
-        world.blocks().values(), untouched.blocks().values(), strict=True
-    ):
-        for field in fields(block):
-            same = np.array_equal(
-                getattr(block, field.name), getattr(before, field.name), equal_nan=True
-            )
-            require(same, f"{type(block).__name__}.{field.name} was changed")
+    for name, block in world.blocks().items():
+        for column, before in vars(untouched.blocks()[name]).items():
+            same = np.array_equal(getattr(block, column), before, equal_nan=True)
+            require(same, f"{type(block).__name__}.{column} was changed")
 
 
 def still_vehicle_stays_still(make: MakeEstimator) -> None:
@@ -478,9 +456,7 @@ def still_vehicle_stays_still(make: MakeEstimator) -> None:
         # gravity and Earth's rate are the only motions that it could make up
         moved = start.between(estimate.world_T_body)
         drift_m = float(np.linalg.norm(moved.translation()))
-        turn_rad = float(
-            np.linalg.norm(Rotation.from_matrix(moved.rotation().matrix()).as_rotvec())
-        )
+        turn_rad = float(np.linalg.norm(gtsam.Rot3.Logmap(moved.rotation())))
         require(drift_m < STILL_DRIFT_M, f"a still vehicle drifts by {drift_m:.3f} m")
         require(
             turn_rad < STILL_TURN_RAD, f"a still vehicle turns by {turn_rad:.4f} rad"

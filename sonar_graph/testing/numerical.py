@@ -145,14 +145,10 @@ def check_jacobians(
     >>> check_jacobians(factor, values)
     """
     noise = factor.noiseModel()
-    if not isinstance(noise, gtsam.noiseModel.Gaussian) or isinstance(
-        noise, gtsam.noiseModel.Constrained
-    ):
-        advice = (
-            "; leave out its kernel"
-            if isinstance(noise, gtsam.noiseModel.Robust)
-            else ""
-        )
+    models = gtsam.noiseModel
+    is_constrained = isinstance(noise, models.Constrained)
+    if is_constrained or not isinstance(noise, models.Gaussian):
+        advice = "; leave out its kernel" if isinstance(noise, models.Robust) else ""
         raise TypeError(
             f"expected a factor with a Gaussian noise model, not {type(noise).__name__}{advice}"
         )
@@ -227,9 +223,7 @@ def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> 
             f"expected finite NEES of at least 0, not {impossible.tolist() or 'none'}"
         )
     total_dof = len(squares) * dof
-    lowest, highest = (
-        float(bound) / total_dof for bound in chi2.interval(confidence, total_dof)
-    )
+    lowest, highest = np.divide(chi2.interval(confidence, total_dof), total_dof)
     mean = float(squares.mean() / dof)
     if not lowest <= mean <= highest:
         side, sizes = ("below", "large") if mean < lowest else ("above", "small")

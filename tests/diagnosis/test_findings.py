@@ -1,6 +1,5 @@
 """Truth by hand: places, arms, biases and a vehicle that lies tilted; and the simulator's moving one."""
 
-import tomllib
 from dataclasses import replace
 from typing import Any
 
@@ -19,19 +18,21 @@ from sonar_graph.diagnosis import Finding
 from sonar_graph.diagnosis.start import (
     StartTilt,
     bias_findings,
-    find_start_heading,
     find_start_tilt,
     lever_findings,
+    start_heading_finding,
     tilt_findings,
     with_bias,
     with_fitted,
 )
-from sonar_graph.measurements import Dvl, Heading, Imu
+from sonar_graph.measurements import Imu
 from sonar_graph.navigation.alignment import DvlMatch, Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
+
+from .runs import dvl_rows, heading_rows, lines_of, spoilt, unstated
 
 UNKNOWN = Estimate1D(np.nan, np.inf, "too little turning")
 GIVEN = parse(
@@ -49,88 +50,79 @@ GIVEN = parse(
 A_MINUTE = np.array([0.0, 0.0, 60.0])
 
 
-def match(
-    lever: tuple[Estimate1D, ...], bias: tuple[Estimate1D, ...] = (UNKNOWN,) * 3
-) -> DvlMatch:
-    return DvlMatch(UNKNOWN, UNKNOWN, UNKNOWN, lever, UNKNOWN, bias)  # type: ignore[arg-type]
+def with_arm(*lever: Estimate1D) -> DvlMatch:
+    return replace(DvlMatch.unknown(UNKNOWN.reason), lever=lever)
 
 
-def arm(*values: float, sigma: float = 0.01) -> Any:
+def along(*values: float, sigma: float = 0.01) -> Any:
     """Estimates of as many numbers."""
     return tuple(Estimate1D(value, sigma) for value in values)
 
 
-def lines_of(row: Finding) -> list[dict[str, Any]]:
-    """The two lines of an advice."""
-    return [tomllib.loads(line) for line in row.advice.split("`")[1::2]]
+def actions(rows: list[Finding]) -> list[bool]:
+    return [row.acts for row in rows]
 
 
 def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
-    rows = lever_findings(match(arm(-0.2, 0.11, 0.9)), GIVEN)
-    assert [row.acts for row in rows] == [True, False, True]
-    texts = [row.text() for row in rows]
-    assert "not the calibration's -1.50 m" in texts[0]
-    assert (
-        texts[1] == "+0.110 ± 0.020 m: the calibration's +0.10 m fits, no need to act"
-    )
-    assert texts[2] == "+0.900 ± 0.020 m: put right by the line above"
+    match = with_arm(*along(-0.2, 0.11, 0.9))
+    rows = lever_findings(match, GIVEN)
+    assert actions(rows) == [True, False, True]
+    first, second, third = (row.text() for row in rows)
+    assert "not the calibration's -1.50 m" in first
+    assert second == "+0.110 ± 0.020 m: the calibration's +0.10 m fits, no need to act"
+    assert third == "+0.900 ± 0.020 m: put right by the line above"
     imu, dvl = lines_of(rows[0])
-    places = [
-        imu["imu"]["mounting"]["translation_m"],
-        dvl["dvl"]["mounting"]["translation_m"],
-    ]
-    assert np.subtract((-1.0, 0.2, 0.3), places[0]) == pytest.approx([-0.2, 0.1, 0.9])
-    assert np.subtract(places[1], (0.5, 0.1, 0.0)) == pytest.approx([-0.2, 0.1, 0.9])
-    assert with_fitted(
-        match(arm(-0.2, 0.11, 0.9)), GIVEN
-    ).imu.mounting.translation_m == pytest.approx(places[0])
+    of_imu = imu["imu"]["mounting"]["translation_m"]
+    of_dvl = dvl["dvl"]["mounting"]["translation_m"]
+    found = pytest.approx([-0.2, 0.1, 0.9])
+    assert np.subtract((-1.0, 0.2, 0.3), of_imu) == found
+    assert np.subtract(of_dvl, (0.5, 0.1, 0.0)) == found
+    place = with_fitted(match, GIVEN).imu.mounting.translation_m
+    assert place == pytest.approx(of_imu)
 
 
 def test_an_unobservable_axis_of_the_lever_arm_keeps_its_value():
-    rows = lever_findings(match((UNKNOWN, *arm(0.6, 0.3))), GIVEN)
+    rows = lever_findings(with_arm(UNKNOWN, *along(0.6, 0.3)), GIVEN)
     assert rows[0].text() == "cannot be told: too little turning"
-    assert [row.acts for row in rows] == [False, True, False]
+    assert actions(rows) == [False, True, False]
     assert "`imu.mounting.translation_m = [0.500, -0.400, 0.000]`" in rows[1].advice
-    rows = [
-        *lever_findings(match((UNKNOWN,) * 3), GIVEN),
-        *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu, A_MINUTE),
-    ]
-    assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
-    assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
-    assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
+    nothing = (UNKNOWN,) * 3
+    (arm,) = lever_findings(with_arm(*nothing), GIVEN)
+    (bias,) = bias_findings(nothing, ("",) * 3, GIVEN.imu, A_MINUTE)
+    assert arm.text() == bias.text() == "cannot be told: too little turning"
+    assert with_fitted(with_arm(*nothing), GIVEN) == GIVEN
+
+
+SOURCES = ("from 20 s of rest", "from turns", "from turns")
 
 
 def test_a_bias_beyond_its_sigma_is_stated_along_the_axes_of_the_imu():
-    sources = ("from 20 s of rest", "from turns", "from turns")
-    biases = arm(1e-3, 1.5e-4, -4e-3, sigma=1e-4)
-    body_R_imu = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    imu = GIVEN.imu.model_copy(
-        update={
-            "gyro_bias_rad_s": (0.0, 0.0, 5e-4),
-            "mounting": Mounting(rpy_rad=(0.0, 0.0, np.pi / 2)),
-        }
-    )
-    rows = bias_findings(biases, sources, imu, A_MINUTE)
-    assert [row.acts for row in rows] == [True, False, True]
+    biases = along(1e-3, 1.5e-4, -4e-3, sigma=1e-4)
+    turned = Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))
+    before = {"gyro_bias_rad_s": (0.0, 0.0, 5e-4), "mounting": turned}
+    imu = GIVEN.imu.model_copy(update=before)
+    rows = bias_findings(biases, SOURCES, imu, A_MINUTE)
+    assert actions(rows) == [True, False, True]
     assert "from 20 s of rest" in rows[0].text()
     stated, sigma = (line["imu"] for line in lines_of(rows[0]))
-    expected = body_R_imu.T @ [1e-3, 0.0, -4e-3] + [0.0, 0.0, 5e-4]
+    expected = [0.0, -1e-3, -4e-3 + 5e-4]
     assert stated["gyro_bias_rad_s"] == pytest.approx(expected, abs=1e-6)
     assert sigma["gyro_bias_sigma"] == 1e-4
     assert rows[2].advice == "put right by the line above"
     # 0.24 rad over a minute
     assert rows[0].grave
-    assert not bias_findings(biases, sources, imu, A_MINUTE / 10)[0].grave
-    left = arm(0.0, 1.5e-4, 0.0, sigma=1e-4)
-    changed = with_bias(biases, imu)
-    rows = bias_findings(left, sources, changed, A_MINUTE)
-    assert not any(row.acts for row in rows)
-    # the rotation of the Earth is no fault of a gyro
+    assert not bias_findings(biases, SOURCES, imu, A_MINUTE / 10)[0].grave
+    left = along(0.0, 1.5e-4, 0.0, sigma=1e-4)
+    rows = bias_findings(left, SOURCES, with_bias(biases, imu), A_MINUTE)
+    assert not any(actions(rows))
+
+
+@pytest.mark.parametrize(("rate", "acts"), [(7.3e-5, False), (1.2e-4, True)])
+def test_the_rotation_of_the_earth_is_no_fault_of_a_gyro(rate: float, acts: bool):
     fibre = ImuCalibration(gyro_bias_sigma=3e-6)
-    turn = arm(7.3e-5, 0.0, -7.3e-5, sigma=1e-5)
-    assert not any(row.acts for row in bias_findings(turn, sources, fibre, A_MINUTE))
-    more = arm(1.2e-4, 0.0, 0.0, sigma=1e-5)
-    assert bias_findings(more, sources, fibre, A_MINUTE)[0].acts
+    turn = along(rate, 0.0, 0.0, sigma=1e-5)
+    rows = bias_findings(turn, SOURCES, fibre, A_MINUTE)
+    assert actions(rows) == [acts, False, False]
 
 
 ROLL = 0.12
@@ -139,27 +131,29 @@ BIAS = np.array([3e-4, -2e-4, 1e-4])
 NS = 1_000_000_000
 
 
+UP = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
+
+
 def started(**start: object) -> Calibration:
     """Calibration with a stated start."""
     return Calibration(start=Start(source="stated", **start))
 
 
-def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequence:
+def resting(rest_s: float, lay_s: float = 0.0) -> Sequence:
     """Tilted and still for so long, then off at 0.4 m/s² for two seconds; the Doppler log may begin later."""
     rng = np.random.default_rng(2)
-    t = np.arange(0, duration_s, 0.01)
-    dvl_t = np.arange(lay_s, duration_s, 0.2)
-    up = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
-    off = ((t > rest_s) & (t < rest_s + 2.0))[:, None] * np.array([0.4, 0.0, 0.0])
-    force = STANDARD_GRAVITY * up + off + 1.2e-2 * rng.standard_normal((len(t), 3))
+    t = np.arange(0, 60.0, 0.01)
+    dvl_t = np.arange(lay_s, 60.0, 0.2)
+    ahead = [1.0, 0.0, 0.0]
+    off = np.outer((t > rest_s) & (t < rest_s + 2.0), ahead)
+    white = rng.standard_normal((len(t), 3))
+    force = STANDARD_GRAVITY * UP + 0.4 * off + 1.2e-2 * white
     rate = BIAS + 1.2e-3 * rng.standard_normal((len(t), 3))
-    speed = 0.4 * np.clip(dvl_t - rest_s, 0.0, 2.0)
-    velocity = np.outer(speed, [1.0, 0.0, 0.0]) + 0.01 * rng.standard_normal(
-        (len(dvl_t), 3)
-    )
+    speed = np.outer(0.4 * np.clip(dvl_t - rest_s, 0.0, 2.0), ahead)
+    velocity = speed + 0.01 * rng.standard_normal(speed.shape)
     imu_ns, dvl_ns = (np.round(NS * seconds).astype(np.int64) for seconds in (t, dvl_t))
-    dvl = Dvl(dvl_ns, velocity, np.full((len(dvl_t), 3, 3), np.nan))
-    return Sequence("by hand", Calibration(), Imu(imu_ns, rate, force), dvl)
+    imu = Imu(imu_ns, rate, force)
+    return Sequence("by hand", Calibration(), imu, dvl_rows(dvl_ns, velocity))
 
 
 def assert_tilt(found: StartTilt, roll_pitch: tuple[float, float]) -> None:
@@ -189,38 +183,28 @@ def test_a_slow_turn_that_the_heading_confirms_is_no_gyro_bias(
 ):
     """About the vertical of a tilted vehicle; and no turn without a heading that distinguishes it from a bias."""
     run = resting(50.0)
-    up = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
-    turning = replace(
-        run.imu, angular_velocity=run.imu.angular_velocity + turn_rad_s * up
-    )
-    t = np.arange(0, 60, 0.1)
-    yaw_rad = (
-        3.0
-        + (said_rad_s or 0.0) * t
-        + 0.005 * np.random.default_rng(0).standard_normal(len(t))
-    )
-    heading = Heading(
-        np.round(NS * t).astype(np.int64), yaw_rad, np.full(len(t), np.nan)
-    )
-    found = find_start_tilt(
-        replace(run, imu=turning, heading=None if said_rad_s is None else heading)
-    )
-    bias = found.gyro_bias()
-    for one, true in zip(bias, BIAS + left * up, strict=True):
-        assert one.value == pytest.approx(true, abs=8e-4)
-    assert ("less the turn of the heading" in found.said) == (
-        turn_rad_s != 0 and bool(said_rad_s)
-    )
+    rate = run.imu.angular_velocity + turn_rad_s * UP
+    run = spoilt(run, "imu", angular_velocity=rate)
+    if said_rad_s is not None:
+        t = np.arange(0, 60, 0.1)
+        noise = 0.005 * np.random.default_rng(0).standard_normal(len(t))
+        stamps_ns = np.round(NS * t).astype(np.int64)
+        heading = heading_rows(stamps_ns, 3.0 + said_rad_s * t + noise)
+        run = replace(run, heading=heading)
+    found = find_start_tilt(run)
+    bias = [one.value for one in found.gyro_bias()]
+    assert bias == pytest.approx(BIAS + left * UP, abs=8e-4)
+    is_said = turn_rad_s != 0 and bool(said_rad_s)
+    assert ("less the turn of the heading" in found.said) == is_said
 
 
 def test_without_rest_the_first_minute_of_motion_gives_the_tilt():
     late = find_start_tilt(resting(15.0, lay_s=14.0))
-    assert not late.is_rest
     assert "in motion" in late.said
-    run = simulate_mission(MissionOptions(seed=8, duration_s=70, landmarks=1))
-    _, pitch, roll = (
-        run.truth.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
-    )
+    options = MissionOptions(seed=8, duration_s=70, landmarks=1)
+    run = simulate_mission(options)
+    start = run.truth.at(np.array([run.start_ns])).rotations()
+    _, pitch, roll = start.as_euler("ZYX")[0].tolist()
     for sequence, rpy in ((resting(4.0), (ROLL, PITCH)), (run, (roll, pitch))):
         found = find_start_tilt(sequence)
         assert found.said.endswith("s in motion")
@@ -231,7 +215,7 @@ def test_without_rest_the_first_minute_of_motion_gives_the_tilt():
 def test_a_wrong_start_is_found_with_the_line_that_mends_it():
     found = find_start_tilt(resting(50.0))
     rows = tilt_findings(found, started(rpy_rad=(0.0, PITCH, 0.3)), yaw_rad=0.9)
-    assert [row.acts for row in rows] == [True, False]
+    assert actions(rows) == [True, False]
     assert "from 40 s of rest, not the calibration's +0.00°" in rows[0].text()
     assert "the calibration's -4.01° fits, no need to act" in rows[1].text()
     *of_start, of_imu = lines_of(rows[0])
@@ -251,24 +235,13 @@ def test_a_wrong_start_is_found_with_the_line_that_mends_it():
 
 def test_what_speaks_against_both_ways_is_said_in_one_row():
     """No accelerometers; velocities that have nothing to do with the accelerations; a calibration without noise."""
-    run = resting(50.0)
-    blind = replace(
-        run,
-        imu=Imu(
-            run.imu.stamps_ns,
-            run.imu.angular_velocity,
-            np.full((len(run.imu), 3), np.nan),
-        ),
-    )
+    run = resting(4.0)
+    blind = spoilt(run, "imu", specific_force=unstated(len(run.imu), 3))
     found = find_start_tilt(blind)
-    assert found.tilt is None
     (row,) = tilt_findings(found, Calibration(), 0.0)
     assert row.text() == "cannot be told: no accelerometers"
-    assert not row.acts
-    run = resting(4.0)
     velocity = np.random.default_rng(0).standard_normal((len(run.dvl), 3))
-    wild = Dvl(run.dvl.stamps_ns, velocity, run.dvl.velocity_cov)
-    found = find_start_tilt(replace(run, dvl=wild))
+    found = find_start_tilt(spoilt(run, "dvl", velocity=velocity))
     assert found == StartTilt(None, found.said)
     assert "at rest: Imu.specific_force: varies" in found.said
     assert "in motion: alignment: velocities and accelerations differ" in found.said
@@ -277,9 +250,8 @@ def test_what_speaks_against_both_ways_is_said_in_one_row():
         "imu": {"gyro_noise_density": 0.0, "accel_noise_density": 0.0},
         "dvl": {"velocity_sigma_m_s": [0.0] * 3},
     }
-    found = find_start_tilt(
-        replace(run, calibration=parse(Calibration, silent, "by hand"))
-    )
+    known = parse(Calibration, silent, "by hand")
+    found = find_start_tilt(replace(run, calibration=known))
     assert found.said.endswith("in motion: the calibration's noise is zero")
 
 
@@ -295,8 +267,9 @@ def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float
     reference = Trajectory.without_covariances(
         stamps_ns, np.zeros((len(t), 3)), turning
     )
-    found = find_start_heading(run, reference, Estimate1D(0.0, 0.1))
-    assert found.error.sigma == pytest.approx(np.hypot(np.radians(0.1), 0.01), rel=1e-6)
-    assert found.rpy_rad[2] == pytest.approx(
-        0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6
-    )
+    offset = Estimate1D(0.0, 0.1)
+    no_tilt = StartTilt(None, "no rows")
+    found, yaw_rad = start_heading_finding(run, reference, offset, no_tilt)
+    sigma = np.hypot(0.1, np.degrees(0.01))
+    assert found.estimate.sigma == pytest.approx(sigma, rel=1e-6)
+    assert yaw_rad == pytest.approx(0.1 * max(begin_s, 0.0), abs=1e-6)

@@ -11,31 +11,21 @@ from sonar_graph.diagnosis import aiding_check
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import by_climb, sighting_changes
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Heading, LandmarkDetections
+from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
+from .runs import compass, recalibrated, spoilt, without_imu
+
 RUN = simulate_mission(MissionOptions(seed=4, duration_s=100.0, landmarks=1))
-
-
-def motion_of(run: Sequence) -> BodyMotion:
-    motion = BodyMotion.of(run)
-    assert motion is not None
-    return motion
 
 
 def true_poses(motion: BodyMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, unwrapped yaw and up in the body at the rows."""
     at_ns = motion.origin_ns + np.round(motion.seconds * 1e9).astype(np.int64)
-    at_ns = np.clip(at_ns, RUN.truth.stamps_ns[0], RUN.truth.stamps_ns[-1])
-    poses = RUN.truth.at(at_ns)
+    poses = RUN.truth.at(np.clip(at_ns, *RUN.truth.stamps_ns[[0, -1]]))
     yaw = np.unwrap(poses.rotations().as_euler("ZYX")[:, 0])
     return poses.positions, yaw, poses.rotations().as_matrix()[:, 2]
-
-
-def without_imu(run: Sequence, begin_s: float, end_s: float) -> Sequence:
-    t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
-    return replace(run, imu=run.imu.rows((t <= begin_s) | (t >= end_s)))
 
 
 @pytest.mark.parametrize(("missing", "parts"), [(1, 1), (2, 2)])
@@ -44,7 +34,7 @@ def test_two_missing_rows_of_a_slow_doppler_log_are_a_gap(missing: int, parts: i
     t = (RUN.dvl.stamps_ns - RUN.dvl.stamps_ns[0]) * 1e-9
     each_second = np.flatnonzero(np.diff(np.floor(t + 1e-6), prepend=-1.0) > 0)
     kept = np.delete(each_second, slice(30, 30 + missing))
-    motion = motion_of(replace(RUN, dvl=RUN.dvl.rows(kept)))
+    motion = BodyMotion.of(replace(RUN, dvl=RUN.dvl.rows(kept)))
     assert len(np.unique(motion.parts)) == parts
 
 
@@ -52,13 +42,8 @@ def test_two_missing_rows_of_a_slow_doppler_log_are_a_gap(missing: int, parts: i
 def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
     """A bias that the calibration knows is taken off."""
     rate = RUN.imu.angular_velocity + np.array([0.0, 0.0, bias])
-    section = RUN.calibration.imu.model_copy(update={"gyro_bias_rad_s": (0, 0, bias)})
-    run = replace(
-        RUN,
-        imu=replace(RUN.imu, angular_velocity=rate),
-        calibration=RUN.calibration.model_copy(update={"imu": section}),
-    )
-    motion = motion_of(run)
+    run = recalibrated(RUN, "imu", gyro_bias_rad_s=(0.0, 0.0, bias))
+    motion = BodyMotion.of(spoilt(run, "imu", angular_velocity=rate))
     places, yaw, up = true_poses(motion)
     level = places @ [1.0, 1j, 0.0]
     assert motion.yaw_rad == pytest.approx(yaw - yaw[0], abs=0.03)
@@ -70,7 +55,7 @@ def test_yaw_height_path_and_up_are_those_of_the_vehicle(bias: float):
 
 
 def test_an_imu_hole_splits_motion_and_reference():
-    motion = motion_of(without_imu(RUN, 40.0, 46.0))
+    motion = BodyMotion.of(without_imu(RUN, 40.0, 46.0))
     assert set(motion.parts) == {0, 1}
     yaw = motion.reference(motion.yaw_rad)
     assert np.isnan(yaw(np.array([41.0, 43.0, 45.0]))).all()
@@ -83,54 +68,62 @@ def test_an_imu_hole_splits_motion_and_reference():
 @pytest.mark.parametrize("angle", [-0.7, 0.5 * np.pi])
 def test_velocities_turned_on_the_body_turn_the_path(angle: float):
     """To the left where the angle is positive; the arm to the log is taken off before."""
-    section = RUN.calibration.dvl.model_copy(update={"mounting": Mounting()})
-    run = replace(RUN, calibration=RUN.calibration.model_copy(update={"dvl": section}))
-    level = replace(RUN.imu, angular_velocity=RUN.imu.angular_velocity * [0, 0, 1])
-    run = replace(run, imu=level)
-    velocity = Rotation.from_euler("z", angle).apply(run.dvl.velocity * [1, 1, 0])
-    ahead = replace(run, dvl=replace(run.dvl, velocity=run.dvl.velocity * [1, 1, 0]))
-    turned = replace(run, dvl=replace(run.dvl, velocity=velocity))
-    length_m = np.abs(motion_of(ahead).path_m).max()
-    expected = motion_of(ahead).path_m * np.exp(1j * angle)
-    assert np.abs(motion_of(turned).path_m - expected).max() < 0.05 * length_m
+    run = recalibrated(RUN, "dvl", mounting=Mounting())
+    run = spoilt(run, "imu", angular_velocity=run.imu.angular_velocity * [0, 0, 1])
+    level = run.dvl.velocity * [1, 1, 0]
+    velocity = Rotation.from_euler("z", angle).apply(level)
+    ahead, turned = (
+        BodyMotion.of(spoilt(run, "dvl", velocity=one)).path_m
+        for one in (level, velocity)
+    )
+    off_m = np.abs(turned - ahead * np.exp(1j * angle))
+    assert off_m.max() < 0.05 * np.abs(ahead).max()
 
 
 @pytest.mark.parametrize("is_broken", [True, False])
-def test_a_turn_in_a_hole_of_the_imu_is_no_bias_of_the_gyros(
-    is_broken: bool, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_turn_in_a_hole_of_the_imu_is_no_bias_of_the_gyros(is_broken: bool):
     """The heading has a turn that no gyro felt; drawn straight across the hole it is a bias."""
-    t = (RUN.imu.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
-    poses = RUN.truth
-    at_s = (poses.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
-    rows = slice(0, len(poses), 10)
-    yaw = np.unwrap(poses.rotations().as_euler("ZYX")[:, 0]) + 1.0 * (at_s > 43.0)
-    heading = Heading(poses.stamps_ns[rows], yaw[rows], np.full(len(yaw[rows]), np.nan))
-    run = replace(RUN, imu=RUN.imu.rows((t <= 40.0) | (t >= 46.0)), heading=heading)
-    motion = motion_of(run)
+    at_s = (RUN.truth.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
+    run = compass(RUN, lambda yaw_rad: yaw_rad + (at_s[::10] > 43.0), sigma_rad=0.0)
+    run = without_imu(run, 40.0, 46.0)
+    motion = BodyMotion.of(run)
     if not is_broken:
         motion = replace(motion, parts=np.zeros_like(motion.parts))
     found = aiding_check.vertical_bias(run, motion)
-    assert found is not None
     assert (abs(found.estimate.value) < 1e-3) == is_broken
     match = aiding_check.HEADING.compare(run, motion)
-    rows = list(aiding_check.heading_findings(match, run, LogConfig(), motion))
+    rows = aiding_check.heading_findings(match, run, LogConfig(), motion)
     assert not (is_broken and any(row.acts for row in rows))
 
 
-def by_hand(seconds: np.ndarray, parts: list[int], height_m: np.ndarray) -> BodyMotion:
+def climbing(climb_m_s: float) -> BodyMotion:
     """A level vehicle that goes ahead at 0.5 m/s and climbs."""
-    n = len(seconds)
+    seconds = np.arange(0.0, 40.0, 0.5)
+    zero = np.zeros(len(seconds))
     return BodyMotion(
         origin_ns=0,
         seconds=seconds,
-        parts=np.array(parts),
-        up=np.tile([0.0, 0.0, 1.0], (n, 1)),
-        yaw_rad=np.zeros(n),
-        height_m=height_m,
+        parts=zero.astype(int),
+        up=np.outer(zero + 1.0, [0.0, 0.0, 1.0]),
+        yaw_rad=zero,
+        height_m=climb_m_s * seconds,
         path_m=0.5 * seconds + 0j,
         ahead_m=0.5 * seconds,
     )
+
+
+def seen_ahead(motion: BodyMotion, range_m: np.ndarray, ids: np.ndarray) -> Sequence:
+    """The run with landmarks straight ahead of the sonar at the rows of a motion."""
+    n = len(range_m)
+    seen = LandmarkDetections(
+        np.round(motion.seconds * 1e9).astype(np.int64),
+        range_m,
+        np.zeros(n),
+        np.tile(np.diag([1e-4, 1e-4]), (n, 1, 1)),
+        ids[:, None].astype(np.int64),
+        np.ones((n, 1)),
+    )
+    return replace(RUN, detections=seen)
 
 
 @pytest.mark.parametrize("climb_m_s", [0.2, -0.2])
@@ -138,41 +131,15 @@ def test_a_sonar_that_looks_down_sees_ranges_change_as_the_vehicle_climbs(
     climb_m_s: float,
 ) -> None:
     """Landmark in the plane of a sonar with a pitch of 45 degrees: p_j = p_i - d, all by hand."""
-    seconds = np.arange(0.0, 40.0, 0.5)
-    motion = by_hand(seconds, [0] * len(seconds), climb_m_s * seconds)
+    motion = climbing(climb_m_s)
+    zero = np.zeros(len(motion.seconds))
     down = Mounting(rpy_rad=(0.0, np.pi / 4, 0.0))
-    sonar = RUN.calibration.sonar.model_copy(update={"mounting": down})
-    n = len(seconds)
-    seen = LandmarkDetections(
-        np.round(seconds * 1e9).astype(np.int64),
-        np.full(n, 10.0),
-        np.zeros(n),
-        np.tile(np.diag([1e-4, 1e-4]), (n, 1, 1)),
-        np.zeros((n, 1), dtype=np.int64),
-        np.ones((n, 1)),
-    )
-    calibration = RUN.calibration.model_copy(update={"sonar": sonar})
-    run = replace(RUN, detections=seen, calibration=calibration)
+    run = recalibrated(seen_ahead(motion, zero + 10.0, zero), "sonar", mounting=down)
     changes = sighting_changes(run, motion)
-    assert changes is not None
     place = 10.0 * np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
-    moved = np.array([0.5, 0.0, climb_m_s]) * 1.0
-    expected = np.linalg.norm(place - moved) - 10.0
+    expected = np.linalg.norm(place - [0.5, 0.0, climb_m_s]) - 10.0
     found = changes.range.reference(changes.range.seconds)
     np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def seen_ahead(level_m: np.ndarray, below_m: np.ndarray) -> LandmarkDetections:
-    """One landmark ahead of a level sonar, by its level distance and depth below the sonar, shape (n,) each."""
-    n = len(level_m)
-    return LandmarkDetections(
-        np.arange(n, dtype=np.int64) * 500_000_000,
-        np.hypot(level_m, below_m),
-        np.zeros(n),
-        np.tile(np.diag([1e-4, 1e-4]), (n, 1, 1)),
-        np.zeros((n, 1), dtype=np.int64),
-        np.ones((n, 1)),
-    )
 
 
 @pytest.mark.parametrize(("climb_m_s", "is_sure"), [(-0.15, False), (0.0, True)])
@@ -180,20 +147,16 @@ def test_a_dive_towards_landmarks_is_no_scale_of_their_ranges(
     climb_m_s: float, is_sure: bool
 ) -> None:
     """A landmark at the end of the dive is nearer by sin(e) dz; its right ranges leave the gain's interval at 1."""
-    seconds = np.arange(0.0, 40.0, 0.5)
-    motion = by_hand(seconds, [0] * len(seconds), climb_m_s * seconds)
+    motion = climbing(climb_m_s)
+    until_next = 10.0 - motion.seconds % 10.0
     lever = RUN.calibration.sonar.mounting.translation_m[0]
-    until_next = 10.0 - seconds % 10.0
-    seen = seen_ahead(9.0 - lever + 0.5 * until_next, climb_m_s * until_next)
-    seen = replace(seen, candidate_ids=(seconds[:, None] // 10).astype(np.int64))
+    range_m = np.hypot(9.0 - lever + 0.5 * until_next, climb_m_s * until_next)
     level = Mounting(translation_m=(lever, 0.0, 0.0))
-    sonar = RUN.calibration.sonar.model_copy(update={"mounting": level})
-    calibration = RUN.calibration.model_copy(update={"sonar": sonar})
-    run = replace(RUN, detections=seen, calibration=calibration)
-    found = aiding_check.sighting_match(run, motion, of_range=True)
-    assert found is not None
-    assert abs(found.gain.value - 1.0) < 2.0 * found.gain.sigma + 1e-3
-    assert (found.gain.sigma < 0.01) == is_sure
+    run = seen_ahead(motion, range_m, motion.seconds // 10)
+    run = recalibrated(run, "sonar", mounting=level)
+    gain = aiding_check.sighting_match(run, motion, of_range=True).gain
+    assert abs(gain.value - 1.0) < 2.0 * gain.sigma + 1e-3
+    assert (gain.sigma < 0.01) == is_sure
 
 
 def test_heave_that_has_nothing_to_do_with_the_ranges_leaves_their_gain_sure() -> None:
@@ -202,8 +165,7 @@ def test_heave_that_has_nothing_to_do_with_the_ranges_leaves_their_gain_sure() -
     heave = np.tile([0.05, -0.05], 20)
     passage = np.zeros(40, dtype=np.int64)
     assert by_climb(longer, heave, passage) == pytest.approx(0.0, abs=1e-12)
-    dive = np.full(40, -0.25)
-    assert by_climb(longer, dive, passage) == pytest.approx(0.5)
+    assert by_climb(longer, longer / 2, passage) == pytest.approx(0.5)
     # the sides on which two passages pass do not cancel each other
     halves = np.repeat([0, 1], 20)
     assert by_climb(longer, np.repeat([0.25, -0.25], 20), halves) == pytest.approx(0.5)

@@ -5,17 +5,14 @@ from dataclasses import replace
 import pytest
 
 from sonar_graph.calibration import Start
-from sonar_graph.diagnosis import check_sensors
-from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
+from .runs import grave, names, started
+
 BASIN = simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1))
+UNKNOWN = replace(BASIN, truth=None)
 PLACE = BASIN.calibration.start.position_m
 YAW_RAD = BASIN.calibration.start.rpy_rad[2]
-
-
-def started(run: Sequence, start: Start) -> Sequence:
-    return replace(run, calibration=run.calibration.model_copy(update={"start": start}))
 
 
 def stated(
@@ -29,36 +26,32 @@ def stated(
     )
 
 
-def grave(run: Sequence) -> list[str]:
-    return [finding.quantity for finding in check_sensors(run) if finding.grave]
-
-
-@pytest.mark.parametrize("run", [BASIN, replace(BASIN, truth=None)])
+@pytest.mark.parametrize("run", [BASIN, UNKNOWN])
 def test_a_start_that_agrees_is_not_named(run):
     assert grave(started(run, stated(east_m=0.3))) == []
 
 
 def test_a_start_far_from_the_truth_is_named_with_the_line_that_mends_it():
-    found = check_sensors(started(BASIN, stated(east_m=-2.0)))
-    assert found[0].quantity == "start position: distance from the truth"
-    assert found[0].estimate.value == pytest.approx(2.0, abs=0.05)
-    assert found[0].grave
-    assert "`start.position_m = [" in found[0].line
+    found, *_ = grave(started(BASIN, stated(east_m=-2.0)))
+    assert found.quantity == "start position: distance from the truth"
+    assert found.estimate.value == pytest.approx(2.0, abs=0.05)
+    assert "`start.position_m = [" in found.line
 
 
-@pytest.mark.parametrize("start", [stated(east_m=2.0)])
-def test_without_a_truth_the_map_contradicts_a_wrong_start(start):
-    run = started(replace(BASIN, truth=None), start)
-    assert grave(run) == ["start pose"]
+def test_without_a_truth_the_map_contradicts_a_wrong_start():
+    run = started(UNKNOWN, stated(east_m=2.0))
+    assert names(grave(run)) == ["start pose"]
     assert grave(replace(run, true_landmarks=None)) == []
 
 
-def test_the_yaw_sigma_of_a_start_makes_the_places_of_landmarks_unsure():
-    run = replace(BASIN, truth=None)
-    assert grave(started(run, stated(turn_rad=1.0)))
-    assert not grave(started(run, stated(turn_rad=1.0, yaw_sigma_rad=1.0)))
+@pytest.mark.parametrize(("yaw_sigma_rad", "is_named"), [(0.01, True), (1.0, False)])
+def test_the_yaw_sigma_of_a_start_makes_the_places_of_landmarks_unsure(
+    yaw_sigma_rad, is_named
+):
+    start = stated(turn_rad=1.0, yaw_sigma_rad=yaw_sigma_rad)
+    assert bool(grave(started(UNKNOWN, start))) == is_named
 
 
 def test_a_start_that_defines_the_world_contradicts_nothing():
     anywhere = Start(position_m=(0.0, 0.0, PLACE[2]), source="vehicle")
-    assert grave(started(replace(BASIN, truth=None), anywhere)) == []
+    assert grave(started(UNKNOWN, anywhere)) == []

@@ -1,20 +1,28 @@
 """A turn between IMU and Doppler log: the turned one is named where something else shows it, else both are."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Mounting, Start
-from sonar_graph.diagnosis import Finding, check_sensors
-from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Dvl, Heading, Imu, PositionFixes
+from sonar_graph.calibration import Start
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
-from .test_sensor_check import line_of
+from .runs import (
+    acting,
+    compass,
+    fixed,
+    grave,
+    level_vehicle,
+    line_of,
+    lines_of,
+    recalibrated,
+    spoilt,
+    started,
+    with_mounting,
+)
 
 WORLD = simulate_mission(MissionOptions(seed=4, duration_s=60, landmarks=40))
 OTHER = {"imu": "dvl", "dvl": "imu"}
@@ -29,42 +37,17 @@ def with_turned(
     body_R_sensor = section.mounting.pose().rotation().matrix()
     # what a sensor measures whose true mounting is the turn of the stated one
     R = (body_R_turned @ body_R_sensor).T @ body_R_sensor
+    names = ("velocity",) if role == "dvl" else ("angular_velocity", "specific_force")
     rows = getattr(run, role)
-    fields = ("velocity",) if role == "dvl" else ("angular_velocity", "specific_force")
-    turned = {name: getattr(rows, name) @ R.T for name in fields}
-    return replace(run, **{role: replace(rows, **turned)})
+    return spoilt(run, role, **{name: getattr(rows, name) @ R.T for name in names})
 
 
-def with_sensors(run: Sequence, *, sonar: bool, fixes: bool, heading: bool) -> Sequence:
-    rng = np.random.default_rng(0)
-    truth = run.truth
-    rows = slice(0, len(truth), 10)
-    n = len(truth.stamps_ns[rows])
-    places = truth.positions[rows] + 0.1 * rng.standard_normal((n, 3))
-    yaw_rad = truth.rotations().as_euler("ZYX")[rows, 0]
-    compass = Heading(
-        truth.stamps_ns[rows],
-        yaw_rad + 0.01 * rng.standard_normal(n),
-        np.full(n, np.nan),
-    )
-    known = PositionFixes(truth.stamps_ns[rows], places, np.full((n, 3, 3), np.nan))
-    return replace(
-        run,
-        detections=run.detections if sonar else None,
-        positions=known if fixes else None,
-        heading=compass if heading else None,
-        truth=None,
-    )
-
-
-def acting(run: Sequence) -> list[Finding]:
-    return [f for f in check_sensors(run, LogConfig()) if f.grave]
-
-
-def with_measured_start(run: Sequence) -> Sequence:
-    start = run.calibration.start.model_copy(update={"source": "fixes"})
-    calibration = run.calibration.model_copy(update={"start": start})
-    return replace(run, calibration=calibration)
+def with_only(*sensors: str) -> Sequence:
+    """The mission with some of sonar, fixes and heading."""
+    run = fixed(compass(WORLD, sigma_rad=0.01), sigma_m=0.1, every_s=0.2)
+    roles = {"sonar": "detections", "fixes": "positions", "heading": "heading"}
+    missing = {role: None for name, role in roles.items() if name not in sensors}
+    return replace(run, truth=None, **missing)
 
 
 @pytest.mark.parametrize(
@@ -74,10 +57,7 @@ def with_measured_start(run: Sequence) -> Sequence:
 def test_a_third_sensor_shows_which_is_turned_and_its_line_puts_all_right(
     role: str, yaw_rad: float, witness: str
 ) -> None:
-    run = with_sensors(
-        WORLD, sonar=witness == "sonar", fixes=witness == "fixes", heading=False
-    )
-    (finding,) = acting(with_turned(run, role, yaw_rad))
+    (finding,) = grave(with_turned(with_only(witness), role, yaw_rad))
     assert finding.quantity.startswith({"imu": "IMU", "dvl": "DVL"}[role])
     assert f"`{role}.mounting.rpy_rad" in finding.line
     assert f"`{OTHER[role]}.mounting" not in finding.line
@@ -89,52 +69,32 @@ def test_a_third_sensor_shows_which_is_turned_and_its_line_puts_all_right(
 def swaying() -> Sequence:
     """A level vehicle that turns, sways and heaves: velocities along all axes of the body show how it is turned."""
     t = np.arange(0.0, 90.0, 0.02)
-    rng = np.random.default_rng(3)
-    turn = Rotation.from_rotvec(0.8 * np.outer(np.sin(0.2 * t), [0.0, 0.0, 1.0]))
     ahead = 1.0 + 0.2 * np.sin(0.5 * t)
     velocity = np.column_stack([ahead, 0.3 * np.sin(0.9 * t), 0.2 * np.sin(0.7 * t)])
-    acceleration = np.gradient(turn.apply(velocity), t, axis=0)
-    force = turn.inv().apply(np.add(acceleration, [0.0, 0.0, 9.80665]))
-    rate = np.column_stack([0.0 * t, 0.0 * t, 0.16 * np.cos(0.2 * t)])
-    stamps_ns = np.rint(t * 1e9).astype(np.int64)
-    slow = slice(None, None, 10)
-    noisy = velocity[slow] + 0.005 * rng.standard_normal((len(t[slow]), 3))
+    run = level_vehicle(velocity, 0.16 * np.cos(0.2 * t), seed=3)
     start = Start(position_m=(0.0, 0.0, 0.0), rpy_rad=(0.0, 0.0, 0.0))
-    return Sequence(
-        name="swaying",
-        calibration=Calibration(start=start),
-        imu=Imu(
-            stamps_ns,
-            rate + 1e-4 * rng.standard_normal(rate.shape),
-            force + 0.01 * rng.standard_normal(force.shape),
-        ),
-        dvl=Dvl(stamps_ns[slow], noisy, np.full((len(noisy), 3, 3), np.nan)),
-    )
+    return started(run, start)
 
 
 @pytest.mark.parametrize("is_stated", [True, False])
 @pytest.mark.parametrize(
     ("role", "axis", "angle_rad"),
-    [("imu", "x", 0.2), ("dvl", "x", -0.5), ("imu", "y", -0.5), ("dvl", "y", 0.1)],
+    [("imu", "x", 0.2), ("imu", "y", -0.5), ("dvl", "y", 0.1)],
 )
 def test_a_stated_start_shows_which_is_rolled_or_pitched(
     role: str, axis: str, angle_rad: float, is_stated: bool
 ) -> None:
     """Its line puts all right; without a start both lines are given, and no other sensor is blamed."""
-    run = swaying() if is_stated else with_measured_start(swaying())
-    finding, *others = acting(with_turned(run, role, angle_rad, axis))
+    run = swaying() if is_stated else recalibrated(swaying(), "start", source="fixes")
+    finding, *others = grave(with_turned(run, role, angle_rad, axis))
     # a start that nobody states would be measured by the turned IMU
     assert not (is_stated and others)
-    assert finding.quantity.endswith(
-        {"x": "mounting roll", "y": "mounting pitch"}[axis]
-    )
-    lines = re.findall(r"`(\w+)\.mounting\.rpy_rad = \[(.*?)\]`", finding.line)
-    found = {name: [float(angle) for angle in text.split(",")] for name, text in lines}
-    assert set(found) == ({role} if is_stated else {"imu", "dvl"})
-    roll, pitch, yaw = found[role]
-    turned = {"x": roll, "y": pitch}[axis]
-    assert turned == pytest.approx(angle_rad, abs=0.02)
-    assert abs(roll) + abs(pitch) + abs(yaw) - abs(turned) < 0.04
+    assert finding.quantity.endswith({"x": " roll", "y": " pitch"}[axis])
+    found = {name: line for one in lines_of(finding) for name, line in one.items()}
+    assert found.keys() == ({role} if is_stated else {"imu", "dvl"})
+    expected = np.multiply(angle_rad, [axis == "x", axis == "y", False])
+    angles_rad = found[role]["mounting"]["rpy_rad"]
+    assert angles_rad == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize("bias_m_s2", [(0.1, 0.0, 0.0), (0.0, -0.4, 0.0)])
@@ -143,64 +103,50 @@ def test_a_bias_of_the_accelerometers_is_told_from_gravity_as_the_vehicle_turns(
 ) -> None:
     """Its line, in the axes of an IMU that is turned on the vehicle, takes it away for all that follows."""
     run = swaying()
-    body_R_imu = Rotation.from_euler("z", 0.5)
-    imu = run.calibration.imu.model_copy(
-        update={"mounting": Mounting(rpy_rad=(0.0, 0.0, 0.5))}
-    )
-    force = body_R_imu.inv().apply(run.imu.specific_force) + bias_m_s2
-    rate = body_R_imu.inv().apply(run.imu.angular_velocity)
-    biased = replace(
-        run,
-        imu=Imu(run.imu.stamps_ns, rate, force),
-        calibration=run.calibration.model_copy(update={"imu": imu}),
-    )
-    found = [f for f in check_sensors(biased) if f.acts]
+    imu_R_body = Rotation.from_euler("z", 0.5).inv()
+    force = imu_R_body.apply(run.imu.specific_force) + bias_m_s2
+    rate = imu_R_body.apply(run.imu.angular_velocity)
+    biased = spoilt(run, "imu", specific_force=force, angular_velocity=rate)
+    biased = with_mounting(biased, "imu", rpy_rad=(0.0, 0.0, 0.5))
+    found = acting(biased)
     assert {f.quantity[:18] for f in found} == {"accelerometer bias"}
-    known = line_of(found[0])["imu"]["accel_bias_m_s2"]
-    assert known == pytest.approx(bias_m_s2, abs=0.01)
-    right = imu.model_copy(update={"accel_bias_m_s2": tuple(known)})
-    mended = replace(
-        biased, calibration=run.calibration.model_copy(update={"imu": right})
-    )
-    assert not [f for f in check_sensors(mended) if f.acts]
+    known = line_of(found[0])["imu"]
+    assert known["accel_bias_m_s2"] == pytest.approx(bias_m_s2, abs=0.01)
+    assert not acting(recalibrated(biased, "imu", **known))
 
 
 def test_a_turn_about_both_level_axes_has_one_line() -> None:
     run = with_turned(with_turned(swaying(), "dvl", 0.2, "x"), "dvl", 0.07, "y")
-    (finding,) = acting(run)
+    (finding,) = grave(run)
     roll, pitch, _ = line_of(finding)["dvl"]["mounting"]["rpy_rad"]
     assert [roll, pitch] == pytest.approx([0.2, 0.07], abs=0.02)
-    (small,) = acting(with_turned(swaying(), "dvl", 0.07, "y"))
+    (small,) = grave(with_turned(swaying(), "dvl", 0.07, "y"))
     assert small.quantity == "DVL mounting pitch"
 
 
 def test_a_start_that_is_tilted_like_a_turned_imu_decides_nothing() -> None:
     """It may have been read off that IMU: its gravity fits, and the Doppler log would be blamed."""
     run = with_turned(swaying(), "imu", 0.2, "x")
-    tilted = run.calibration.start.model_copy(update={"rpy_rad": (-0.2, 0.0, 0.0)})
-    calibration = run.calibration.model_copy(update={"start": tilted})
-    finding, *_ = acting(replace(run, calibration=calibration))
+    finding, *_ = grave(recalibrated(run, "start", rpy_rad=(-0.2, 0.0, 0.0)))
     assert "no other sensor shows which" in finding.advice
 
 
 def test_mountings_that_are_right_within_two_degrees_are_left_alone() -> None:
-    assert acting(swaying()) == []
-    assert acting(with_turned(swaying(), "dvl", 0.03, "x")) == []
+    assert grave(swaying()) == []
+    assert grave(with_turned(swaying(), "dvl", 0.03, "x")) == []
 
 
 @pytest.mark.parametrize("role", ["imu", "dvl"])
 def test_without_a_third_sensor_both_are_named(role: str) -> None:
-    run = with_sensors(WORLD, sonar=False, fixes=False, heading=True)
-    (finding,) = acting(with_turned(run, role, np.pi / 2))
+    (finding,) = grave(with_turned(with_only("heading"), role, np.pi / 2))
     assert "no other sensor shows which" in finding.advice
     for name in ("imu", "dvl"):
         assert f"`{name}.mounting.rpy_rad" in finding.line
 
 
 def test_a_heading_may_come_from_the_turned_imu() -> None:
-    run = with_sensors(WORLD, sonar=False, fixes=True, heading=True)
-    run = with_measured_start(run)
-    (of_imu,) = acting(with_turned(run, "imu", np.pi / 2))
+    run = recalibrated(with_only("fixes", "heading"), "start", source="fixes")
+    (of_imu,) = grave(with_turned(run, "imu", np.pi / 2))
     assert of_imu.quantity.startswith("IMU")
-    (of_dvl,) = acting(with_turned(run, "dvl", np.pi / 2))
+    (of_dvl,) = grave(with_turned(run, "dvl", np.pi / 2))
     assert "no other sensor shows which" in of_dvl.advice

@@ -39,51 +39,42 @@ def log(tmp_path_factory):
 def test_who_recognises_live_without_a_height_over_the_floor_is_told(
     tmp_path, log, knows_floor
 ):
-    given = (
-        PartialCalibration.parse({"floor": {"z_m": 0.0, "sigma_m": 0.02}}, "a test")
-        if knows_floor
-        else None
-    )
+    floor = {"floor": {"z_m": 0.0, "sigma_m": 0.02}} if knows_floor else {}
+    given = PartialCalibration.parse(floor, "a test")
+    said, _ = lived(tmp_path, log, 4.0, calibration=given)
+    told = [line for line in said if "floor" in line and "plane of the image" in line]
+    assert len(told) == (not knows_floor)
+
+
+def lived(folder, log, until_s, **options):
+    """What a live run on the first seconds of a log said, and its outcome; each image is waited for."""
     messages = messages_of(log, np.random.default_rng(0), 0.0)
     said = []
-    options = LiveOptions("dead-reckoning", calibration=given)
+    made = LiveOptions("dead-reckoning", **options)
     with (
-        LiveRecord(tmp_path / "record.mcap") as record,
-        LiveRun(record, definition_of, options, [], said.append) as run,
+        LiveRecord(folder / "record.mcap") as record,
+        LiveRun(record, definition_of, made, [], said.append) as run,
     ):
         for message in messages:
-            if message.arrival_ns > messages[0].arrival_ns + 4 * 10**9:
+            if message.arrival_ns > messages[0].arrival_ns + until_s * 1e9:
                 break
-            if message.topic != "/sonar/landmarks":
-                run.accept(message)
-                run.turn(0.0)
-    assert sum("floor" in line and "plane of the image" in line for line in said) == (
-        not knows_floor
-    )
+            if message.topic == "/sonar/landmarks":
+                continue
+            run.accept(message)
+            run.turn(0.0)
+            last_s = time.monotonic() + 60
+            while run.images_waiting and time.monotonic() < last_s:
+                run.turn(0.001)
+        return said, run.finish()
 
 
 @pytest.mark.slow
 def test_live_detections_are_those_of_the_log_and_the_record_has_them(tmp_path, log):
-    """Each image is waited for; the images of the first two seconds, before the recogniser begins, are missing."""
+    """The images of the first two seconds, before the recogniser begins, are missing."""
     whole = recognise(log)
     # messages do not contain it
     given = PartialCalibration.parse(read_log(log).calibration.model_dump(), "its log")
-    messages = messages_of(log, np.random.default_rng(0), 0.0)
-    last_ns = messages[0].arrival_ns + int(LOG_S * 1e9)
-    with LiveRecord(tmp_path / "record.mcap") as record:
-        options = LiveOptions("dead-reckoning", lateness_s=5.0, calibration=given)
-        with LiveRun(record, definition_of, options, [], lambda _: None) as run:
-            for message in messages:
-                if message.arrival_ns > last_ns:
-                    break
-                if message.topic == "/sonar/landmarks":
-                    continue
-                run.accept(message)
-                run.turn(0.0)
-                until_s = time.monotonic() + 60
-                while run.images_waiting and time.monotonic() < until_s:
-                    run.turn(0.001)
-            outcome = run.finish()
+    _, outcome = lived(tmp_path, log, LOG_S, lateness_s=5.0, calibration=given)
     assert len(outcome.causal) > 100
     recorded = read_log(tmp_path / "record.mcap")
     assert recorded.detections is not None

@@ -1,9 +1,10 @@
 """Live over the loopback: programs that are not ours read what is sent, and feed what is received."""
 
-import socket
+import struct
 import threading
 import time
 from contextlib import ExitStack
+from itertools import count
 
 import mcap_ros2._dynamic as ros2
 import numpy as np
@@ -19,10 +20,11 @@ from sonar_graph.live import (
     definition_of,
     open_link,
     open_session,
+    play_messages,
     subscribe,
 )
 from sonar_graph.live.foxglove_link import FoxgloveLink
-from sonar_graph.live.outlets import DETECTED, TOPICS, ZenohOutlet
+from sonar_graph.live.outlets import DETECTED, TOPICS, zenoh_outlet
 from sonar_graph.live.zenoh_link import parse_key, topic_key, type_hash
 from sonar_graph.logs import LiveRecord, PartialCalibration
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -49,9 +51,17 @@ def test_a_key_gives_topic_and_type_again():
     assert parse_key("0/some/thing/else") is None
 
 
-def test_an_unreachable_router_is_named():
-    with pytest.raises(LogError, match=r"tcp/127\.0\.0\.1:1: zenoh cannot connect"):
-        open_session(["tcp/127.0.0.1:1"])
+@pytest.mark.parametrize(
+    ("where", "fault"),
+    [
+        ("tcp/127.0.0.1:1", "zenoh cannot connect"),
+        ("ws://127.0.0.1:1", "cannot connect"),
+    ],
+)
+def test_a_router_or_bridge_that_is_not_there_is_named(where, fault):
+    pytest.importorskip("websockets")
+    with pytest.raises(LogError, match=f"{where}: {fault}"):
+        open_link([where], 0)
 
 
 @pytest.fixture
@@ -69,29 +79,23 @@ def foreign_publisher(endpoint, messages, ready):
     with zenoh.open(config) as session:
         ready["router"].set()
         ready["subscribed"].wait(60)
-        first_ns = messages[0].arrival_ns
-        begun_s = time.monotonic()
-        for number, message in enumerate(messages):
-            time.sleep(
-                max(
-                    0.0,
-                    begun_s
-                    + (message.arrival_ns - first_ns) * 4e-10
-                    - time.monotonic(),
-                )
-            )
+        numbers = count()
+
+        def put(message):
             package, _, name = message.type_name.split("/")
             key = f"0{message.topic}/{package}::msg::dds_::{name}_/RIHS01_{'0' * 64}"
-            sender = message.topic.encode().ljust(16)[:16]
-            attachment = (
-                number.to_bytes(8, "little")
-                + time.time_ns().to_bytes(8, "little")
-                + b"\x10"
-                + sender
-            )
+            about = (next(numbers), time.time_ns(), 16, message.topic.encode())
+            attachment = struct.pack("<qqB16s", *about)
             session.put(key, message.payload, attachment=attachment)
+
+        play_messages(iter(messages), 2.5, put, lambda: False)
         ready["done"].set()
         ready["end"].wait(60)
+
+
+def read_by_ros(kind, payload):
+    short = kind.replace("/msg/", "/")
+    return ros2.generate_dynamic(short, definition_of(kind))[short](payload)
 
 
 def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
@@ -104,39 +108,34 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
     heard: dict[str, list[bytes]] = {}
     try:
         assert ready["router"].wait(10)
-        config = zenoh.Config()
-        for key, value in (
-            ("mode", '"client"'),
-            ("connect/endpoints", f'["{endpoint}"]'),
-        ):
-            config.insert_json5(key, value)
-        with zenoh.open(config) as listener, open_session([endpoint]) as session:
+        with ExitStack() as stack:
+            listener = stack.enter_context(open_session([endpoint]))
+            session = stack.enter_context(open_session([endpoint]))
             listener.declare_subscriber(
                 "0/**",
                 lambda s: heard.setdefault(str(s.key_expr), []).append(
                     s.payload.to_bytes()
                 ),
             )
-            with LiveRecord(tmp_path / "record.mcap") as record, ExitStack() as stack:
-                given = PartialCalibration(
-                    mission.calibration.model_dump(mode="json"), "of the mission"
-                )
-                options = LiveOptions("ekf-slam", lateness_s=1.0, calibration=given)
-                outlets = [ZenohOutlet(session, 0)]
-                run = stack.enter_context(
-                    LiveRun(record, definition_of, options, outlets, lambda _: None)
-                )
-                subscriptions = subscribe(session, 0, run.accept)
-                time.sleep(0.5)
-                ready["subscribed"].set()
-                last_s = time.monotonic() + 60
-                while not ready["done"].is_set() and time.monotonic() < last_s:
-                    run.turn()
-                for _ in range(20):
-                    run.turn()
-                for one in subscriptions:
-                    one.undeclare()
-                outcome = run.finish()
+            record = stack.enter_context(LiveRecord(tmp_path / "record.mcap"))
+            known = mission.calibration.model_dump(mode="json")
+            given = PartialCalibration(known, "of the mission")
+            options = LiveOptions("ekf-slam", lateness_s=1.0, calibration=given)
+            outlets = [zenoh_outlet(session, 0)]
+            run = stack.enter_context(
+                LiveRun(record, definition_of, options, outlets, lambda _: None)
+            )
+            subscriptions = subscribe(session, 0, run.accept)
+            time.sleep(0.5)
+            ready["subscribed"].set()
+            last_s = time.monotonic() + 60
+            while not ready["done"].is_set() and time.monotonic() < last_s:
+                run.turn()
+            for _ in range(20):
+                run.turn()
+            for one in subscriptions:
+                one.undeclare()
+            outcome = run.finish()
     finally:
         ready["subscribed"].set()
         ready["end"].set()
@@ -144,26 +143,14 @@ def test_strangers_feed_it_and_read_every_topic(tmp_path, mission, endpoint):
     record_read = read_log(tmp_path / "record.mcap")
     assert len(record_read.imu) == len(mission.imu)
     assert len(outcome.causal) >= 0.9 * mission.duration_s * 10
+    newest = {}
     for topic, kind in TOPICS.items():
         if topic == DETECTED:
             continue  # there are no images
         key = topic_key(0, topic, kind, type_hash(kind))
         assert key in heard, f"nothing was heard of {topic}"
-        decode = ros2.generate_dynamic(kind.replace("/msg/", "/"), definition_of(kind))[
-            kind.replace("/msg/", "/")
-        ]
-        read = [decode(payload) for payload in heard[key]]
-        assert len(read) == len(heard[key])
-    odometry = ros2.generate_dynamic(
-        "nav_msgs/Odometry", definition_of("nav_msgs/msg/Odometry")
-    )["nav_msgs/Odometry"]
-    key = topic_key(
-        0,
-        "/sonar_graph/odometry",
-        "nav_msgs/msg/Odometry",
-        type_hash("nav_msgs/msg/Odometry"),
-    )
-    last = odometry(heard[key][-1])
+        newest[topic] = [read_by_ros(kind, payload) for payload in heard[key]][-1]
+    last = newest["/sonar_graph/odometry"]
     at_ns = last.header.stamp.sec * 10**9 + last.header.stamp.nanosec
     place = last.pose.pose.position
     truth = mission.truth.at(np.array([at_ns]))
@@ -175,64 +162,53 @@ def test_a_foxglove_bridge_feeds_it_and_may_break_off(tmp_path, mission):
     foxglove = pytest.importorskip("foxglove")
     pytest.importorskip("websockets")
     messages = messages_of(tmp_path / "log.mcap", np.random.default_rng(0), 0.0)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = int(free_endpoint().rpartition(":")[2])
     context = foxglove.Context()
     channels = {}
-    for topic, kind in {
-        message.topic: message.type_name for message in messages
-    }.items():
-        schema = foxglove.Schema(
-            name=kind, encoding="ros2msg", data=definition_of(kind).encode()
-        )
+    for topic, kind in {m.topic: m.type_name for m in messages}.items():
+        data = definition_of(kind).encode()
+        schema = foxglove.Schema(name=kind, encoding="ros2msg", data=data)
         channels[topic] = foxglove.Channel(
             topic, schema=schema, message_encoding="cdr", context=context
         )
-    server = foxglove.start_server(
-        host="127.0.0.1", port=port, context=context, message_backlog_size=100_000
-    )
+    server = started(foxglove, port, context)
     got: list[Message] = []
+
+    def send(some):
+        for message in some:
+            channels[message.topic].log(message.payload)
+
+    def has_all(some):
+        return len(got) == sum(wanted(message) for message in some)
+
+    half = len(messages) // 2
     try:
         with FoxgloveLink(f"ws://127.0.0.1:{port}") as link:
             link.listen(got.append, lambda _, kind: "Imu" in kind or "Dvl" in kind)
             time.sleep(0.5)
-            half = len(messages) // 2
-            for message in messages[:half]:
-                channels[message.topic].log(message.payload)
-            until(
-                lambda: len(got) == sum(wanted(message) for message in messages[:half])
-            )
+            send(messages[:half])
+            until(lambda: has_all(messages[:half]))
             server.stop()
-            server = restarted(foxglove, port, context)
+            server = started(foxglove, port, context)
             until(lambda: link.breaks == 1)
             time.sleep(2.0)
-            for message in messages[half:]:
-                channels[message.topic].log(message.payload)
-            until(lambda: len(got) == sum(wanted(message) for message in messages))
-            assert link.definition_of("sensor_msgs/msg/Imu") == definition_of(
-                "sensor_msgs/msg/Imu"
-            )
+            send(messages[half:])
+            until(lambda: has_all(messages))
+            kind = "sensor_msgs/msg/Imu"
+            assert link.definition_of(kind) == definition_of(kind)
     finally:
         server.stop()
-    assert [m.payload for m in got] == [m.payload for m in messages if wanted(m)]
-    assert {m.type_name for m in got} == {
-        "sensor_msgs/msg/Imu",
-        "marine_acoustic_msgs/msg/Dvl",
-    }
+    same = [(m.topic, m.type_name, m.payload) for m in messages if wanted(m)]
+    assert [(m.topic, m.type_name, m.payload) for m in got] == same
 
 
-def restarted(foxglove, port, context, longest_s=20.0):
-    """The server again on its port, which the system may still hold for a while."""
+def started(foxglove, port, context, longest_s=20.0):
+    """The server on its port, which the system may still hold for a while."""
+    where = {"host": "127.0.0.1", "port": port, "context": context}
     last_s = time.monotonic() + longest_s
     while True:
         try:
-            return foxglove.start_server(
-                host="127.0.0.1",
-                port=port,
-                context=context,
-                message_backlog_size=100_000,
-            )
+            return foxglove.start_server(**where, message_backlog_size=100_000)
         except RuntimeError:
             if time.monotonic() > last_s:
                 raise
@@ -250,12 +226,6 @@ def until(holds, longest_s=20.0):
     assert holds()
 
 
-def test_a_bridge_that_is_not_there_is_named():
-    pytest.importorskip("websockets")
-    with pytest.raises(LogError, match=r"ws://127\.0\.0\.1:1: cannot connect"):
-        open_link(["ws://127.0.0.1:1"], 0)
-
-
 def test_a_router_that_ends_and_comes_back_is_heard_again(endpoint):
     got = []
     router = open_session(listen=[endpoint])
@@ -263,15 +233,13 @@ def test_a_router_that_ends_and_comes_back_is_heard_again(endpoint):
         subscriptions = subscribe(session, 0, got.append)
         for round_number in (1, 2):
             publisher = Publisher(router, 0, "/imu/data", "sensor_msgs/msg/Imu")
-            last_s = time.monotonic() + 20.0
-            while (
-                len({m.sender for m in got}) < round_number
-                and time.monotonic() < last_s
-            ):
+
+            def is_heard(publisher=publisher, senders=round_number):
                 publisher.put(b"row")
-                time.sleep(0.05)
+                return len({message.sender for message in got}) == senders
+
+            until(is_heard)
             router.close()
             router = open_session(listen=[endpoint])
-        assert len({m.sender for m in got}) == 2
         assert subscriptions
     router.close()

@@ -55,24 +55,17 @@ def test_frames_differ_by_the_newest_correction():
     for k, step in enumerate(world.replay(world.instants(10.0))):
         predictor.add(step.imu, step.dvl)
         if k in (20, 60):
-            predictor.correct(
-                at := Estimate(
-                    step.end_ns, jump if k == 60 else gtsam.Pose3(), np.eye(6)
-                )
-            )
-            assert np.allclose(
-                predictor.predict().world_T_body, at.world_T_body.matrix()
-            )
-        if (now := predictor.predict()) is not None:
-            np.testing.assert_allclose(
-                now.world_T_body, predictor.map_T_odom @ now.odom_T_body, atol=1e-12
-            )
-            if before is not None:
-                assert (
-                    np.linalg.norm(now.odom_T_body[:3, 3] - before.odom_T_body[:3, 3])
-                    < 0.5
-                )
-            before = now
+            pose = jump if k == 60 else gtsam.Pose3()
+            predictor.correct(Estimate(step.end_ns, pose, np.eye(6)))
+            assert np.allclose(predictor.predict().world_T_body, pose.matrix())
+        now = predictor.predict()
+        if now is not None:
+            world_T_body = predictor.map_T_odom @ now.odom_T_body
+            np.testing.assert_allclose(now.world_T_body, world_T_body, atol=1e-12)
+        if before is not None:
+            moved = now.odom_T_body[:3, 3] - before.odom_T_body[:3, 3]
+            assert np.linalg.norm(moved) < 0.5
+        before = now
     assert before is not None
 
 
@@ -89,9 +82,8 @@ def test_messages_say_the_numbers_of_a_prediction(turn):
     )
     forms = PoseForms()
     message = read(ODOMETRY, forms.odometry(at))
-    assert (
-        message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == at.stamp_ns
-    )
+    stamp = message.header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == at.stamp_ns
     assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
     assert same_pose(message.pose.pose.position, message.pose.pose.orientation, pose)
     world_axes = body_to_ros(at.covariance[None], pose.rotation().matrix()[None])[0]
@@ -110,10 +102,7 @@ def read(kind, payload):
 
 
 def same_pose(p, q, pose):
-    found = gtsam.Pose3(
-        gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), np.array([p.x, p.y, p.z])
-    )
-    return (
-        found.equals(pose, 1e-12)
-        and abs(q.w**2 + q.x**2 + q.y**2 + q.z**2 - 1.0) < 1e-12
-    )
+    turn = gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z)
+    found = gtsam.Pose3(turn, np.array([p.x, p.y, p.z]))
+    size = np.linalg.norm([q.w, q.x, q.y, q.z])
+    return found.equals(pose, 1e-12) and abs(size - 1.0) < 1e-12

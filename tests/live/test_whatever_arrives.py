@@ -9,16 +9,15 @@ import pytest
 from sonar_graph import read_log, write_log
 from sonar_graph.devices import velocity_of_beams
 from sonar_graph.live import Engine, Message, definition_of
+from sonar_graph.live.arrivals import MOTION
 from sonar_graph.live.engine import OVERLOADED
 from sonar_graph.live.live_messages import dropped_messages
 from sonar_graph.logs import LiveRecord
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import encode, parse_definition
 from sonar_graph.testing import small_world
-from tests.live.test_live_equals_log import NS, live
-from tests.live.traffic import messages_of
+from tests.live.traffic import NS, assert_record_equals, live, messages_of
 
-BLOCKS = ("imu", "dvl", "depth", "heading", "positions", "detections")
 DVL = "/dvl/data"
 IMU = "/imu/data"
 DETECTIONS = "/sonar/landmarks"
@@ -36,28 +35,19 @@ def stamp_of(message):
 
 
 def stamped(message, stamp_ns):
-    return message._replace(
-        payload=message.payload[:4]
-        + struct.pack("<iI", *divmod(stamp_ns, NS))
-        + message.payload[12:]
-    )
+    stamp = struct.pack("<iI", *divmod(stamp_ns, NS))
+    payload = message.payload[:4] + stamp + message.payload[12:]
+    return message._replace(payload=payload)
 
 
 def message_of(topic, kind, stamp_ns, values, frame="", lengths=None):
     definition = parse_definition(kind, definition_of(kind))
     if kind != "tf2_msgs/msg/TFMessage":
-        header = {"sec": stamp_ns // NS, "nanosec": stamp_ns % NS}
-        values = (
-            values
-            | {f"header.stamp.{k}": v for k, v in header.items()}
-            | {"header.frame_id": frame}
-        )
-    return Message(
-        topic,
-        kind,
-        encode(definition, 1, values, lengths)[0].tobytes(),
-        stamp_ns + 2_000_000,
-    )
+        seconds, nanoseconds = divmod(stamp_ns, NS)
+        stamp = {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds}
+        values = values | stamp | {"header.frame_id": frame}
+    payload = encode(definition, 1, values, lengths)[0].tobytes()
+    return Message(topic, kind, payload, stamp_ns + 2_000_000)
 
 
 def imu(message, force, rates=(0.0, 0.0, 0.1)):
@@ -115,12 +105,10 @@ def detections(stamp_ns, candidates, is_sound=True):
         values |= {
             "azimuth_rad": np.array([[0.1, -0.2]]),
             "covariance": np.tile([0.01, 0.0, 0.0, 0.001], (1, 2)),
-        }
-        values |= {
             "candidate_ids": np.tile(np.arange(candidates), (1, 2)),
             "track": np.array([[0, 1]]),
+            "id_probability": np.full((1, 2 * candidates), 0.9 / candidates),
         }
-        values["id_probability"] = np.full((1, 2 * candidates), 0.9 / candidates)
     return message_of(
         DETECTIONS, "sonar_graph_msgs/msg/LandmarkDetections", stamp_ns, values, "sonar"
     )
@@ -157,16 +145,13 @@ def scrambled(messages, from_s):
     first_ns = messages[0].arrival_ns
     found = []
     for message in messages:
-        data = bytearray(message.payload)
+        data = message.payload
         draw = noise.random()
         at = int(noise.integers(4, len(data)))
-        if (
-            message.topic != "/tf_static"
-            and message.arrival_ns > first_ns + from_s * NS
-            and draw < 0.1
-        ):
-            data[at:] = noise.bytes(len(data) - at) if draw < 0.05 else b""
-        found.append(message._replace(payload=bytes(data)))
+        is_due = message.arrival_ns > first_ns + from_s * NS
+        if message.topic != "/tf_static" and is_due and draw < 0.1:
+            data = data[:at] + noise.bytes(len(data) - at) * (draw < 0.05)
+        found.append(message._replace(payload=data))
     return found
 
 
@@ -183,7 +168,7 @@ def out_of_order(messages):
 
 CASES: dict[str, Callable[[list[Message]], list[Message]]] = {
     "every message twice": lambda m: [again for x in m for again in (x, x)],
-    "messages in any order": lambda m: out_of_order(m),
+    "messages in any order": out_of_order,
     "a first stamp an hour ahead": lambda m: [
         stamped(first_imu(m), stamp_of(first_imu(m)) + 3600 * NS),
         *m,
@@ -290,44 +275,21 @@ CASES: dict[str, Callable[[list[Message]], list[Message]]] = {
 }
 
 
-def assert_equal(engine, steps, path):
-    record = read_log(path)
-    assert record.calibration == engine.calibration
-    replayed = list(record.replay(record.instants(float(record.notes["live.rate_hz"]))))
-    assert len(steps) >= 50
-    assert [step.end_ns for step in steps] == [step.end_ns for step in replayed]
-    for mine, theirs in zip(steps, replayed, strict=True):
-        for name in BLOCKS:
-            one = getattr(mine, name)
-            other = getattr(theirs, name)
-            assert (one is None) == (other is None), name
-            for column, values in {} if one is None else vars(one).items():
-                expected = getattr(other, column)
-                if values.ndim == 2:  # candidates that none of the step has
-                    expected, rest = np.split(expected, [values.shape[1]], axis=1)
-                    assert (rest <= 0).all()
-                assert values.tobytes() == expected.tobytes(), f"{name}.{column}"
+OPTIONS = {
+    "rotated axes": {
+        "config": LogConfig.parse(
+            {role: {"rotation": [10.0, 20.0, 30.0]} for role in MOTION}, "mine.toml"
+        )
+    },
+    "a rate that is no short number": {"rate_hz": 100 / 3},
+}
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [*CASES, *OPTIONS])
 def test_a_record_gives_the_steps_that_were_live(tmp_path, messages, case):
-    engine, steps = live(tmp_path / "record.mcap", CASES[case](messages))
-    assert_equal(engine, steps, tmp_path / "record.mcap")
-
-
-def test_rotated_axes_give_the_same_bits_for_one_message_and_for_all(
-    tmp_path, messages
-):
-    config = LogConfig.parse(
-        {role: {"rotation": [10.0, 20.0, 30.0]} for role in ("imu", "dvl")}, "mine.toml"
-    )
-    engine, steps = live(tmp_path / "record.mcap", messages, config=config)
-    assert_equal(engine, steps, tmp_path / "record.mcap")
-
-
-def test_a_rate_that_is_no_short_number_is_recorded_to_the_bit(tmp_path, messages):
-    engine, steps = live(tmp_path / "record.mcap", messages, rate_hz=100 / 3)
-    assert_equal(engine, steps, tmp_path / "record.mcap")
+    come = CASES[case](messages) if case in CASES else messages
+    options = OPTIONS.get(case, {})
+    assert_record_equals(*live(tmp_path / "record.mcap", come, **options))
 
 
 def test_a_velocity_of_beams_does_not_depend_on_other_pings():
@@ -343,16 +305,16 @@ def test_a_velocity_of_beams_does_not_depend_on_other_pings():
     assert velocity.tobytes() == np.concatenate(alone).tobytes()
 
 
+def number_of_detections(steps):
+    return sum(len(step.detections) for step in steps if step.detections is not None)
+
+
 def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):
     """Unreadable first messages neither end the run nor cost the sensor."""
-    engine, steps = live(
-        tmp_path / "record.mcap",
-        CASES["late detections of which the first break their rules"](messages),
-    )
+    case = CASES["late detections of which the first break their rules"]
+    engine, steps = live(tmp_path / "record.mcap", case(messages))
     assert engine.generation == 1
-    assert (
-        sum(len(step.detections) for step in steps if step.detections is not None) > 50
-    )
+    assert number_of_detections(steps) > 50
     # its mounting counts too
     stated = small_world().calibration.sonar.mounting.translation_m
     assert engine.calibration.sonar.mounting.translation_m == pytest.approx(stated)
@@ -361,71 +323,52 @@ def test_what_is_sound_of_a_late_sensor_is_used(tmp_path, messages):
 def test_a_late_sensor_that_cannot_be_used_is_named_and_costs_nothing(
     tmp_path, messages
 ):
-    engine, steps = live(
-        tmp_path / "record.mcap", CASES["a late sensor whose frame cannot be"](messages)
-    )
+    case = CASES["a late sensor whose frame cannot be"]
+    engine, steps = live(tmp_path / "record.mcap", case(messages))
     assert engine.generation == 0
     assert len(steps) == 200
-    assert any(
-        "/gps/fix is not used" in line and "quaternion" in line
-        for line in engine.remarks
-    )
+    (line,) = (one for one in engine.remarks if "/gps/fix is not used" in one)
+    assert "quaternion" in line
 
 
 def test_what_is_waited_for_is_said_once(tmp_path, messages):
-    engine, _ = live(
-        tmp_path / "record.mcap",
-        CASES["a Doppler log without bottom lock at first"](messages),
-    )
-    assert (
-        1
-        <= sum(
-            "waiting:" in line and "velocity_mode" in line for line in engine.remarks
-        )
-        <= 4
-    )
+    case = CASES["a Doppler log without bottom lock at first"]
+    engine, _ = live(tmp_path / "record.mcap", case(messages))
+    waits = [one for one in engine.remarks if "waiting:" in one]
+    assert 1 <= sum("velocity_mode" in one for one in waits) <= 4
     assert not engine.waits_for
 
 
-def test_detections_that_were_dropped_for_being_behind_are_counted_once(
-    tmp_path, messages
-):
-    """Also where all began anew before, with a sensor that came late."""
-    late = [
-        m
-        for m in messages
-        if m.topic != "/depth/pose" or m.arrival_ns > messages[0].arrival_ns + 5 * NS
-    ]
-    with LiveRecord(tmp_path / "first.mcap") as record:
+def test_detections_that_a_slow_estimator_missed_are_not_recorded(tmp_path, messages):
+    """They are counted once, also where all began anew before, with a sensor that came late."""
+    late_ns = messages[0].arrival_ns + 5 * NS
+    path = tmp_path / "record.mcap"
+    with LiveRecord(path) as record:
         engine = Engine(record, definition_of)
-        for message in late:
-            engine.take(message)
-            for step in engine.steps():
-                if engine.generation == 1:
-                    for _ in range(2):  # a step is asked for again
-                        engine.without_detections(step, message.arrival_ns)
-    dropped = dropped_messages(tmp_path / "first.mcap")
+        for message in messages:
+            if message.topic != "/depth/pose" or message.arrival_ns > late_ns:
+                engine.take(message)
+            for step in engine.steps() if engine.generation == 1 else ():
+                for _ in range(2):  # a step is asked for again
+                    left = engine.without_detections(step, message.arrival_ns)
+                    assert left.detections is None
+        for step in engine.finish():
+            engine.without_detections(step, message.arrival_ns)
+    dropped = dropped_messages(path)
     assert engine.counts.dropped == {(DETECTIONS, OVERLOADED): len(dropped)}
-    assert dropped
+    assert len(dropped) >= 30
+    assert read_log(path).detections is None
 
 
 def test_rows_that_are_sound_count_beside_others_that_are_not(tmp_path, messages):
     """One range of two that is not a number does not cost the other."""
-    stamps = doppler_stamps(messages)
-    half = [detections(at, 1) for at in stamps]
-    half = [
-        m._replace(
-            payload=m.payload.replace(struct.pack("<d", 6.0), struct.pack("<d", np.nan))
-        )
-        for m in half
-    ]
-    engine, steps = live(
-        tmp_path / "record.mcap", in_order(without(messages, DETECTIONS) + half)
-    )
-    assert (
-        sum(len(step.detections) for step in steps if step.detections is not None) > 90
-    )
-    assert_equal(engine, steps, tmp_path / "record.mcap")
+    six, nan = (struct.pack("<d", number) for number in (6.0, np.nan))
+    whole = [detections(at, 1) for at in doppler_stamps(messages)]
+    half = [m._replace(payload=m.payload.replace(six, nan)) for m in whole]
+    come = in_order(without(messages, DETECTIONS) + half)
+    engine, steps = live(tmp_path / "record.mcap", come)
+    assert number_of_detections(steps) > 90
+    assert_record_equals(engine, steps)
 
 
 def test_a_topic_in_use_stays_so_when_all_begins_anew(tmp_path, messages):
@@ -441,4 +384,4 @@ def test_a_topic_in_use_stays_so_when_all_begins_anew(tmp_path, messages):
     engine, steps = live(tmp_path / "record.mcap", in_order(late + second))
     assert engine.generation == 1
     assert any(step.detections is not None for step in steps)
-    assert_equal(engine, steps, tmp_path / "record.mcap")
+    assert_record_equals(engine, steps)

@@ -6,9 +6,13 @@ from pathlib import Path
 import numpy as np
 from mcap.reader import make_reader
 
-from sonar_graph.live import Message
+from sonar_graph import read_log
+from sonar_graph.live import Engine, LiveOptions, Message, definition_of
+from sonar_graph.logs import LiveRecord
+from sonar_graph.measurements import BLOCKS
 
 TRUTH = "/ground_truth"
+NS = 1_000_000_000
 
 
 def messages_of(
@@ -23,17 +27,12 @@ def messages_of(
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             if not channel.topic.startswith(TRUTH):
-                arrival_ns = (
-                    message.log_time
-                    + int(noise.uniform(0.0, delay_s) * 1e9)
-                    + 1_000_000
-                )
-                newest_ns[channel.topic] = arrival_ns = max(
-                    arrival_ns, newest_ns.get(channel.topic, 0)
-                )
-                found.append(
-                    Message(channel.topic, schema.name, message.data, arrival_ns)
-                )
+                delay_ns = int(noise.uniform(0.0, delay_s) * 1e9) + 1_000_000
+                arrival_ns = message.log_time + delay_ns
+                arrival_ns = max(arrival_ns, newest_ns.get(channel.topic, 0))
+                newest_ns[channel.topic] = arrival_ns
+                content = (channel.topic, schema.name, message.data)
+                found.append(Message(*content, arrival_ns))
     return sorted(found, key=lambda message: message.arrival_ns)
 
 
@@ -42,3 +41,46 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def live(path: Path, messages: list[Message], **options):
+    """The engine after all messages, and the steps that it gave since it began anew last."""
+    with LiveRecord(path) as record:
+        engine = Engine(record, definition_of, LiveOptions(**options))
+        generation = 0
+        steps = []
+        for message in messages:
+            engine.take(message)
+            if engine.generation != generation:
+                generation = engine.generation
+                steps = []
+            for step in engine.steps():
+                steps.append(step)
+                assert len(steps) < 1000, "steps without end"
+        steps += engine.finish()
+    return engine, steps
+
+
+def assert_same_steps(mine, theirs):
+    """Steps with the same rows, to the bit."""
+    assert [step.end_ns for step in mine] == [step.end_ns for step in theirs]
+    for ours, others in zip(mine, theirs, strict=True):
+        for name in BLOCKS:
+            one = getattr(ours, name)
+            other = getattr(others, name)
+            assert (one is None) == (other is None), name
+            for column, values in {} if one is None else vars(one).items():
+                expected = getattr(other, column)
+                if values.ndim == 2:  # candidates that none of the step has
+                    expected, rest = np.split(expected, [values.shape[1]], axis=1)
+                    assert (rest <= 0).all()
+                assert values.tobytes() == expected.tobytes(), f"{name}.{column}"
+
+
+def assert_record_equals(engine, steps):
+    """The record of a run gives the steps that were live."""
+    record = read_log(engine.record_path)
+    assert record.calibration == engine.calibration
+    assert len(steps) >= 50
+    rate_hz = float(record.notes["live.rate_hz"])
+    assert_same_steps(steps, list(record.replay(record.instants(rate_hz))))
