@@ -232,7 +232,7 @@ def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path)
     (tmp_path / "over.toml").write_text(
         textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
     )
-    assert "floor.z_m" in PartialCalibration.read(tmp_path / "over.toml").fields()
+    assert "floor.z_m" in PartialCalibration.read(tmp_path / "over.toml").before("log")
     assert (
         f'Of one landmark and of "none of them" {LEAST_FRAMES} labelled frames are needed'
         in page

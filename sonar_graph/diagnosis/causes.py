@@ -5,7 +5,6 @@ whole log. It is named where q is sure, e is clearly smaller than ``y - x - a``,
 docs/theory/sensor_check.md.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,6 +24,7 @@ from sonar_graph.diagnosis.findings import (
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion, holes_beside
 from sonar_graph.diagnosis.signals import (
+    Explained,
     Match,
     SignalStep,
     SignalStretch,
@@ -45,7 +45,8 @@ LEAST_DRIFT_M_S = 0.03
 LEAST_PITCH_RAD = np.radians(3.0)
 LEAST_SONAR_TURN_RAD = np.radians(5.0)
 LEAST_DEVIATION_RAD = np.radians(3.0)
-LARGEST_DEVIATION_RAD = np.radians(45.0)
+LARGEST_IRON_RAD = np.radians(45.0)
+"""Deviation that iron of the vehicle makes at most."""
 LEAST_CURRENT_M_S = 0.05
 BEST_NOISE_M_S = 0.01
 """Of a row of a good Doppler log."""
@@ -69,8 +70,8 @@ class Cause:
     """Length of q from which on the cause matters."""
     advice: Callable[[Values, Calibration], Advice]
     """By q."""
-    largest: float = math.inf
-    """Length of q beyond which something else is wrong."""
+    least_turn_rad: float = 0.0
+    """Range of a heading that a stretch must have."""
 
 
 def since_middle(stretch: SignalStretch) -> Values:
@@ -184,10 +185,12 @@ def sonar_turn_advice(q: Values, calibration: Calibration) -> Advice:
 
 def deviation_advice(q: Values, _: Calibration) -> Advice:
     """A compass whose error depends on its heading."""
-    largest_deg = float(np.degrees(np.linalg.norm(q)))
+    largest_rad = float(np.linalg.norm(q))
+    iron = "a compass among iron of the vehicle, or a wrong calibration of it"
+    cause = f"degrees that are read as radians, or {iron}"
     return Advice(
-        f"it is off by up to {largest_deg:.2g}° one way and the other as the vehicle turns: a compass among iron of the "
-        "vehicle, or a wrong calibration of it",
+        f"it is off by up to {np.degrees(largest_rad):.2g}° one way and the other as the vehicle turns: "
+        f"{cause if largest_rad > LARGEST_IRON_RAD else iron}",
         f"calibrate the compass on the vehicle, or {unused('heading')}",
     )
 
@@ -225,7 +228,8 @@ DEVIATION = Cause(
     # its owner knows of a bias, which may change with the heading
     least=lambda known: max(LEAST_DEVIATION_RAD, 2.0 * known.heading.bias_sigma_rad),
     advice=deviation_advice,
-    largest=LARGEST_DEVIATION_RAD,
+    # on a shorter turn, between two holes of the IMU, it looks like a drift
+    least_turn_rad=np.radians(45.0),
 )
 # iron that the Earth magnetises beside magnets on the vehicle
 SOFT_IRON = replace(DEVIATION, columns=of_turn_and_twice, wanted=4)
@@ -244,6 +248,16 @@ OF_FIXES = CURRENT(columns=of_current, wanted=1)
 OF_RANGES = CURRENT(columns=of_current_beside_scale, wanted=2)
 
 
+def explained_by(cause: Cause, found: Match) -> Explained | None:
+    """What a cause explains, by the stretches that can show it."""
+    shown = [
+        stretch
+        for stretch in found.stretches
+        if np.ptp(stretch.y.real) >= cause.least_turn_rad
+    ]
+    return explained(shown, cause.columns, cause.wanted)
+
+
 def cause_of(
     name: str,
     causes: tuple[Cause, ...],
@@ -255,16 +269,12 @@ def cause_of(
 
     ``most``: largest ratio of the scatter to that of the best gain and delay.
     """
-    tried = (
-        (explained(found.stretches, cause.columns, cause.wanted), cause)
-        for cause in causes
-    )
+    tried = [(explained_by(cause, found), cause) for cause in causes]
     fits = [(result, cause) for result, cause in tried if result and result.is_clear]
     if not fits:
         return None
     result, cause = min(fits, key=lambda fit: fit[0].after)
-    is_too_large = float(np.linalg.norm(result.q)) > cause.largest
-    if is_too_large or result.after > most * found.scatter:
+    if result.after > most * found.scatter:
         return None
     for rival, other in fits:
         is_small = float(np.linalg.norm(rival.q)) < other.least(calibration)

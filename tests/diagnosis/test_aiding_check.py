@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
-from sonar_graph.diagnosis import Finding, aiding_check
+from sonar_graph.diagnosis import Finding, aiding_check, check_sensors
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.units import force_scale
 from sonar_graph.logs.adapters import LogConfig
@@ -294,3 +294,15 @@ def test_first_headings_far_from_a_stated_start_are_grave(
     for finding in found:
         off_deg = np.degrees(off_rad)
         assert finding.estimate.value == pytest.approx(off_deg, abs=3.0)
+
+
+def test_velocities_that_estimators_refuse_count_in_no_check():
+    """Half of the rows are 0 with the variance of a direction that was not measured."""
+    dvl = SEEN.dvl
+    is_refused = np.random.default_rng(0).random(len(dvl)) < 0.4
+    velocity = np.where(is_refused[:, None], 0.0, dvl.velocity)
+    cov = dvl.velocity_cov.copy()
+    cov[is_refused] = 1e6 * np.eye(3)
+    with_refused = spoilt(SEEN, "dvl", velocity=velocity, velocity_cov=cov)
+    without = replace(SEEN, dvl=dvl.rows(~is_refused))
+    assert str(check_sensors(with_refused)) == str(check_sensors(without))

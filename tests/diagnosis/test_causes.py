@@ -76,6 +76,22 @@ def test_a_cause_is_named_with_its_size_and_nothing_else_is_blamed(fault: str):
     assert found.estimate.value == pytest.approx(size, abs=near)
 
 
+@pytest.mark.parametrize(("size_deg", "is_unit"), [(30.0, False), (60.0, True)])
+def test_a_deviation_larger_than_by_iron_may_be_one_of_the_unit(size_deg, is_unit):
+    deviation = np.radians(size_deg) * np.sin(YAW + 0.4)
+    (found,) = grave(observed(yaw_rad=YAW + deviation))
+    assert ("degrees that are read as radians" in found.cause) == is_unit
+
+
+def test_gyros_with_holes_make_no_deviation_of_a_right_compass():
+    """Over two seconds a deviation looks like a drift of the gyros: it was 63 degrees, by 4 sigma."""
+    run = observed()
+    t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    is_hole = (t % 4.0 < 2.0) & (t > 5.0)
+    holed = replace(run, imu=run.imu.rows(~is_hole))
+    assert not [f for f in grave(holed) if "deviation" in f.quantity]
+
+
 @pytest.mark.parametrize(("size_deg", "is_named"), [(25.0, True), (8.0, False)])
 def test_a_compass_that_leaves_the_gyros_for_a_while_is_named(size_deg, is_named):
     bump = np.radians(size_deg) * np.exp(-0.5 * ((T - 40.0) / 6.0) ** 2)

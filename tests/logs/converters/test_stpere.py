@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.evaluation.metrics import horizontal_aligned_rmse
+from sonar_graph.evaluation.metrics import aligned_errors_m, rmse
 from sonar_graph.logs.convert import read_stpere
 
 T0 = 1_000
@@ -115,7 +115,7 @@ def reckoned_error(run, yaw_rad, mirror=False):
         np.interp(run.truth.stamps_ns, stamps_ns, part)
         for part in (path.real, path.imag, 0 * path.real)
     ]
-    return horizontal_aligned_rmse(np.column_stack(at), run.truth.positions)
+    return rmse(aligned_errors_m(np.column_stack(at), run.truth.positions)[:, :2])
 
 
 @pytest.mark.recording
