@@ -86,9 +86,17 @@ class Rows(NamedTuple):
         """Rows that are known at an instant, and always the first DVL row."""
         i = self.imu_ns.searchsorted(at_ns, side="right")
         k = max(self.known_ns.searchsorted(at_ns, side="right"), 1)
-        inertial = [column[:i] for column in self[:3]]
-        log = [column[:k] for column in self[3:7]]
-        return Rows._make([*inertial, *log, self.hold_past, self.turns])
+        return Rows(
+            self.imu_ns[:i],
+            self.rate[:i],
+            self.force[:i],
+            self.dvl_ns[:k],
+            self.velocity[:k],
+            self.cov[:k],
+            self.known_ns[:k],
+            self.hold_past,
+            self.turns,
+        )
 
 
 class Sensors(NamedTuple):
