@@ -62,13 +62,23 @@ def test_a_level_way_is_turned_and_mirrored_as_it_was(angle: float, is_mirrored:
     assert found.lag.value == pytest.approx(0.0, abs=0.05)
 
 
-@pytest.mark.parametrize(("share", "is_found"), [(0.1, True), (0.3, False)])
+@pytest.mark.parametrize(("share", "is_found"), [(0.1, True), (0.5, False)])
 def test_few_outliers_change_nothing_and_many_do(share: float, is_found: bool):
     rng = np.random.default_rng(4)
     y = wave(T) + noise(4) + 20.0 * (rng.random(len(T)) < share)
     found = match([SignalStretch(T, y, wave)])
     assert (found.scatter < 2 * NOISE) == is_found
     assert (abs(found.gain.value - 1.0) < 0.02) == is_found
+
+
+@pytest.mark.parametrize(("more", "left"), [(0, 3 * len(T) // 4), (1, len(T))])
+def test_up_to_a_quarter_of_the_rows_is_left_out(more: int, left: int):
+    """Where more rows are far, the model is wrong, and all rows stay."""
+    y = wave(T) + noise(4)
+    count = len(T) // 4 + more
+    y[:count] += 20.0 * (-1.0) ** np.arange(count)
+    fit = RobustFit.of(wave(T)[None, :, None], SignalStretch(T, y, wave), 0.0)
+    assert fit.kept.sum() == left
 
 
 def test_intervals_cover_the_truth_with_correlated_errors():

@@ -100,8 +100,8 @@ def test_the_last_steps_end_with_imu_and_doppler_log():
     arrivals = given(imu(0), dvl(0), imu(250), dvl(230), depth(900))
     assert ends_ms(arrivals) == [100, 200, 300, 400, 500, 600]
     arrivals = given(imu(0), dvl(0), imu(250), dvl(230))
-    assert ends_ms(arrivals) == [100]
-    assert [step.end_ns // MS for step in arrivals.rest()] == [200]
+    steps = [*arrivals.steps(), *arrivals.rest()]
+    assert [step.end_ns // MS for step in steps] == [100, 200]
 
 
 @pytest.mark.parametrize(
