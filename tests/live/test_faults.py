@@ -123,9 +123,10 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
     def is_gone(message):
         return message.topic == "/dvl/data" and 8 < at_s(messages, message) < 14
 
+    last_s = time.monotonic() + 60
+
     def wait(message):
         """A loaded machine takes longer to notice: the gap lasts until it has."""
-        last_s = time.monotonic() + 20
         while at_s(messages, message) > 13 and time.monotonic() < last_s:
             if any(line.startswith("/dvl/data: nothing") for line in said):
                 return
@@ -148,12 +149,13 @@ def test_a_burst_at_ten_times_the_pace_beside_a_stalled_viewer_loses_nothing(
     for message in messages:
         due_s = np.interp(at_s(messages, message), (0.0, 8.0, 14.0, 25.4), burst_s)
         come.append(message._replace(arrival_ns=first_ns + int(due_s * 1e9)))
+    sender = robot(endpoint, come)
     arrived = []
     with stalled(endpoint), open_session([endpoint]) as session:
         subscriber = session.declare_subscriber(
             "0/sonar_graph/odometry/**", lambda _: arrived.append(time.monotonic())
         )
-        outcome, counts = lived(tmp_path, endpoint, robot(endpoint, come), [])
+        outcome, counts = lived(tmp_path, endpoint, sender, [])
         subscriber.undeclare()
     assert not counts["lost"]
     assert sum(counts["received"].values()) == len(messages)
