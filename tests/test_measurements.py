@@ -112,12 +112,20 @@ def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
     ("made", "message"),
     [
         (
+            lambda n: Imu(n, np.zeros((5, 2)), np.zeros((5, 3))),
+            "Imu.angular_velocity: expected shape (5, 3)",
+        ),
+        (
             lambda n: Imu(n, np.zeros((3, 5)), np.zeros((3, 5))),
             "one row for each of 5 stamps; transpose it",
         ),
         (
             lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))),
             "Dvl.velocity_cov: expected shape (5, 3, 3)",
+        ),
+        (
+            lambda n: Heading(n, np.zeros((5, 1)), np.zeros(5)),
+            "Heading.yaw_rad: expected shape (5,)",
         ),
     ],
 )
@@ -158,6 +166,10 @@ UNSAID = np.full((2, 2, 2), np.nan)
             r"candidate_ids: expected shape \(n, k\).*not \(2,\)",
         ),
         (
+            {"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))},
+            r"candidate_ids: expected shape",
+        ),
+        (
             {"candidate_ids": [[1, 2], [1, 2**56]]},
             r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number",
         ),
@@ -174,6 +186,7 @@ UNSAID = np.full((2, 2, 2), np.nan)
             {"id_probability": [[0.9, 0.2], [0.9, 0.1]]},
             r"id_probability: row 0 .* more than 1 in sum",
         ),
+        ({"id_probability": [[np.nan, 0.1], [0.9, 0.1]]}, r"id_probability: row 0"),
     ],
 )
 def test_detections_that_cannot_be_are_named_in_one_line(columns, said):

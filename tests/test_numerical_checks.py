@@ -69,6 +69,16 @@ def test_a_derivative_has_the_shape_of_the_value_and_angles_are_wrapped():
         check_derivative(azimuth, [[0.0, -1.0]], at=[-1.0, 0.0])
 
 
+def test_columns_belong_to_their_variables():
+    values = gtsam.Values()
+    values.insert(
+        3, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.7, 3.1), np.array([1.0, 2.0, 3.0]))
+    )
+    values.insert(1, np.array([2.0, -1.0, 0.5]))
+    factor = gtsam.RangeFactor3D(3, 1, 2.0, gtsam.noiseModel.Isotropic.Sigma(1, 0.01))
+    check_jacobians(factor, values)
+
+
 @pytest.mark.parametrize(
     ("scale", "said"), [(1.0, None), (0.7, "too large"), (1.4, "too small")]
 )

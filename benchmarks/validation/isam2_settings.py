@@ -65,10 +65,10 @@ def run(sequence: Sequence, settings: dict[str, Any]) -> tuple[Isam2, int, float
     """The estimator at the end, how often its window was updated, and CPU seconds."""
     updates, update = 0, Smoother.update
 
-    def counted(smoother: Smoother) -> Changed:
+    def counted(smoother: Smoother, time_s: float) -> Changed:
         nonlocal updates
         updates += 1
-        return update(smoother)
+        return update(smoother, time_s)
 
     estimator = Isam2(
         sequence.calibration, Odometry(sequence.calibration), Isam2Params(**settings)

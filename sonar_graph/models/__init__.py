@@ -10,7 +10,7 @@ from sonar_graph.models.known_map import FEWEST, MOVED, KnownLandmarks, Verdict,
 from sonar_graph.models.sonar import (
     ACCEPTED, FLOOR_GATE, MINIMUM_PROBABILITY, Mount, body_point_jacobian, elevation_on_floor, floor_elevation,
     identify, locate, locate_from_body, locate_jacobians, polar_difference, project_points, range_azimuth,
-    range_azimuth_jacobians, Sight, sight_of, views, wrap_angle,
+    range_azimuth_jacobians, Sight, sight_of, sonar_point, view_points, wrap_angle,
 )
 
 __all__ = [
@@ -20,6 +20,6 @@ __all__ = [
     "KnownLandmarks", "listed", "locate", "locate_from_body", "locate_jacobians",
     "MINIMUM_PROBABILITY", "Mount", "MOVED", "polar_difference",
     "project_points", "range_azimuth", "range_azimuth_jacobians", "Robust", "RobustKernel", "SCALE", "Sight", "sight_of",
-    "TILT", "tilt_sigma", "up_and_derivative", "up_direction", "Verdict", "views", "wrap_angle",
+    "sonar_point", "TILT", "tilt_sigma", "up_and_derivative", "up_direction", "Verdict", "view_points", "wrap_angle",
     "yaw_and_derivative",
 ]

@@ -28,13 +28,13 @@ error that gyro axes off by a tenth of a degree cause. Without gravity b_tilt is
 """
 
 import math
-from collections import defaultdict
+from collections import Counter
 
 import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import (
     LOWER_LEFT,
@@ -173,24 +173,33 @@ class Contradictions:
     """
 
     def __init__(self) -> None:
-        self._counts: dict[str, Ints] = defaultdict(lambda: np.zeros(3, np.int64))
-        """Rows of each sensor: far from the estimate, beyond doubt, and all."""
+        self._far = Counter[str]()
+        self._judged = Counter[str]()
+        self._beyond_doubt = Counter[str]()
 
     def judge(self, sensor: str, distances: Floats | float) -> None:
         """Count distances in sigmas, of one row or several."""
-        d = np.atleast_1d(distances)
-        limits = (CONTRADICTING_SIGMAS, DOUBTLESS_SIGMAS[sensor])
-        beyond = [int(np.count_nonzero(d > limit)) for limit in limits]
-        self._counts[sensor] += np.array([*beyond, d.size])
+        self._far[sensor] += int(
+            np.count_nonzero(np.asarray(distances) > CONTRADICTING_SIGMAS)
+        )
+        self._judged[sensor] += np.size(distances)
+        self._beyond_doubt[sensor] += int(
+            np.count_nonzero(np.asarray(distances) > DOUBTLESS_SIGMAS[sensor])
+        )
 
     def messages(self) -> list[str]:
         """A line for each sensor that contradicts the estimate in more than `CONTRADICTING_SHARE` of its rows."""
         return [
-            f"{far} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
-            + (" Most are beyond doubt." if doubtless > judged / 2 else "")
-            for sensor, (far, doubtless, judged) in self._counts.items()
+            f"{self._far[sensor]} of {judged} {CAUSES[sensor].format(CONTRADICTING_SIGMAS)}"
+            + (
+                " Most are beyond doubt."
+                if self._beyond_doubt[sensor] > judged / 2
+                else ""
+            )
+            for sensor, judged in self._judged.items()
             # a share of a few rows may be chance
-            if judged >= FEWEST_JUDGED and far > CONTRADICTING_SHARE * judged
+            if judged >= FEWEST_JUDGED
+            and self._far[sensor] > CONTRADICTING_SHARE * judged
         ]
 
 

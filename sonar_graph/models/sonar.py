@@ -38,8 +38,6 @@ from sonar_graph.numerics import (
     cross_matrix,
     inlined,
     mat,
-    position,
-    row_of,
     skew,
     store,
     store_row,
@@ -150,43 +148,50 @@ def sight_of(R: Mat3, X: Vec3, mount: Mount, p: Vec3) -> Sight:
     )
 
 
+class PointViews(NamedTuple):
+    """Expected range and azimuth of m points of the world, with derivatives."""
+
+    z: Floats
+    """Range (m) and azimuth (rad), shape (m, 2)."""
+    by_pose: Floats
+    """Derivative by the right perturbation [theta, rho] of the pose, shape (m, 2, 6)."""
+    by_point: Floats
+    """Derivative by the points, shape (m, 2, 3)."""
+
+
 @compiled
-def views(
-    bodies: Floats, sonars: Floats, points: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """`sight_of` of m points of the world, shape (m, 3), as arrays.
-
-    Parameters
-    ----------
-    bodies, sonars
-        world_T_body and body_T_sonar of each point, shape (m, 3, 4) or (m, 4, 4), or one for all, shape (1, 3, 4).
-
-    Returns
-    -------
-    Range (m) and azimuth (rad), shape (m, 2), and their derivatives by the right perturbation [theta, rho] of the body's
-    pose, shape (m, 2, 6), and by the points, shape (m, 2, 3).
-    """
+def views_from_body(R: Floats, X: Floats, mount: Mount, points: Floats) -> PointViews:
+    """`sight_of` of m points of the world, shape (m, 3), as arrays."""
     m = len(points)
     z = np.empty((m, 2))
-    by_body = np.empty((m, 2, 6))
+    by_pose = np.empty((m, 2, 6))
     by_point = np.empty((m, 2, 3))
     for k in range(m):
-        body = bodies[min(k, len(bodies) - 1)]
-        sonar = sonars[min(k, len(sonars) - 1)]
-        mount = Mount(sonar, sonar[:, 3])
-        sight = sight_of(mat(body), position(body), mount, row_of(points, k))
+        sight = sight_of(
+            mat(R), vec(X), mount, Vec3(points[k, 0], points[k, 1], points[k, 2])
+        )
         z[k, 0] = sight.range_m
         z[k, 1] = sight.azimuth_rad
-        store_row6(sight.range_by_body, by_body[k], 0, 0)
-        store_row6(sight.azimuth_by_body, by_body[k], 1, 0)
+        store_row6(sight.range_by_body, by_pose[k], 0, 0)
+        store_row6(sight.azimuth_by_body, by_pose[k], 1, 0)
         store_row(sight.range_by_point, by_point[k], 0, 0)
         store_row(sight.azimuth_by_point, by_point[k], 1, 0)
-    return z, by_body, by_point
+    return PointViews(z, by_pose, by_point)
+
+
+AT_SONAR = Mount(np.eye(3), np.zeros(3))
+
+
+def view_points(world_T_sonar: gtsam.Pose3, points: Floats) -> PointViews:
+    """Expected range and azimuth of points of the world, shape (m, 3), and derivatives, by the sonar's own pose."""
+    return views_from_body(
+        *_as_arrays(world_T_sonar), AT_SONAR, np.ascontiguousarray(points)
+    )
 
 
 def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
     """Range (m) and azimuth (rad) of one point of the world, shape (2,)."""
-    return range_azimuth_jacobians(world_T_sonar, gtsam.Pose3(), p_world)[0]
+    return view_points(world_T_sonar, p_world[None]).z[0]
 
 
 def range_azimuth_jacobians(
@@ -196,10 +201,11 @@ def range_azimuth_jacobians(
 
     These are by the right perturbation [theta, rho] of the body's pose, shape (2, 6), and by the point, shape (2, 3).
     """
-    body = np.array([world_T_body.matrix()], order="C")
-    sonar = np.array([body_T_sonar.matrix()], order="C")
-    z, by_body, by_point = views(body, sonar, np.ascontiguousarray(p_world)[None])
-    return z[0], by_body[0], by_point[0]
+    mount = Mount(*_as_arrays(body_T_sonar))
+    view = views_from_body(
+        *_as_arrays(world_T_body), mount, np.ascontiguousarray(p_world)[None]
+    )
+    return view.z[0], view.by_pose[0], view.by_point[0]
 
 
 def _as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
@@ -262,12 +268,18 @@ def _point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) ->
     )
 
 
+def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
+    """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
+    return np.array(_point_at(range_m, azimuth_rad, elevation_rad))
+
+
 def locate(
     world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
 ) -> Floats:
     """The point of the world at these spherical coordinates of the sonar, shape (3,), m."""
-    point = np.array(_point_at(range_m, azimuth_rad, elevation_rad))
-    return np.asarray(world_T_sonar.transformFrom(point))
+    return np.asarray(
+        world_T_sonar.transformFrom(sonar_point(range_m, azimuth_rad, elevation_rad))
+    )
 
 
 def locate_jacobians(

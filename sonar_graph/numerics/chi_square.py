@@ -2,7 +2,10 @@
 
 from functools import cache
 
-from scipy.special import chdtri, gammaincinv
+import numpy as np
+from scipy.special import chdtr, chdtri, gammaincinv
+
+from sonar_graph.measurements import Floats
 
 
 @cache  # gates use the same few at every frame
@@ -24,3 +27,8 @@ def chi_square_quantile(probability: float, dof: float) -> float:
 def chi_square_exceeded(probability: float, dof: float) -> float:
     """Value that a chi-square variable exceeds with this probability; exact for tiny probabilities."""
     return float(chdtri(dof, probability))
+
+
+def chi_square_share(values: Floats, dof: float) -> Floats:
+    """Probability that a chi-square variable stays below each of the values, of the same shape."""
+    return np.asarray(chdtr(dof, values), np.float64)

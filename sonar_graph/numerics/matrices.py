@@ -303,12 +303,6 @@ def mat(A: Floats, at: Index = UPPER_LEFT) -> Mat3:
 
 
 @inlined
-def position(T: Floats) -> Vec3:
-    """Position of a pose of shape (4, 4), or of its first three rows."""
-    return Vec3(T[0, 3], T[1, 3], T[2, 3])
-
-
-@inlined
 def mat6(A: Floats) -> Mat6:
     """Matrix from the first six rows and columns of an array."""
     return Mat6(

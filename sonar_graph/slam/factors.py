@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gtsam
 import numpy as np
@@ -43,9 +43,9 @@ from sonar_graph.models import (
     Robust,
     body_point_jacobian,
     polar_difference,
-    range_azimuth_jacobians,
+    project_points,
     up_and_derivative,
-    views,
+    view_points,
     wrap_angle,
     yaw_and_derivative,
 )
@@ -75,7 +75,7 @@ UP = np.array([0.0, 0.0, 1.0])
 class SightingError:
     """Error of one factor, called by GTSAM."""
 
-    __slots__ = ("body_T_sonar", "keys", "z")
+    __slots__ = ("body_T_sonar", "by_body", "keys", "z")
 
     def __init__(
         self, keys: tuple[int, int], body_T_sonar: gtsam.Pose3, z: Floats
@@ -83,6 +83,8 @@ class SightingError:
         self.keys = keys
         self.z = z
         self.body_T_sonar = body_T_sonar
+        # constant: GTSAM calls thousands of times
+        self.by_body = body_T_sonar.inverse().AdjointMap()
 
     def __call__(
         self,
@@ -92,13 +94,12 @@ class SightingError:
     ) -> Floats:
         """Error, shape (2,), m and rad."""
         pose_key, landmark_key = self.keys
-        z, by_pose, by_landmark = range_azimuth_jacobians(
-            values.atPose3(pose_key), self.body_T_sonar, values.atPoint3(landmark_key)
-        )
+        world_T_sonar = values.atPose3(pose_key).compose(self.body_T_sonar)
+        view = view_points(world_T_sonar, values.atPoint3(landmark_key)[None])
         if jacobians is not None:
-            jacobians[0] = by_pose  # (2, 6)
-            jacobians[1] = by_landmark  # (2, 3)
-        return polar_difference(z, self.z)
+            jacobians[0] = view.by_pose[0] @ self.by_body  # (2, 6)
+            jacobians[1] = view.by_point[0]  # (2, 3)
+        return polar_difference(view.z[0], self.z)
 
 
 class CorrelatedSighting(gtsam.CustomFactor):
@@ -122,18 +123,36 @@ class CorrelatedSighting(gtsam.CustomFactor):
         super().__init__(noise, [pose_key, landmark_key], self.law)
 
 
+class SightingViews(NamedTuple):
+    """Landmarks as n sonars see them."""
+
+    world_R_sonar: Floats
+    """Shape (n, 3, 3)."""
+    q: Floats
+    """The landmarks in the sonars' axes, shape (n, 3), m."""
+    D_q: Floats
+    """Derivative of range and azimuth by q, shape (n, 2, 3)."""
+    e: Floats
+    """Whitened errors, shape (n, 2)."""
+    lengths: list[float]
+    """Lengths of those that have a kernel."""
+
+
 class SightingStack:
-    """Many `CorrelatedSighting` as arrays (`batch_solution.StackedGraph`); the same numbers to rounding."""
+    """Many `CorrelatedSighting` as arrays (`batch_solution.Stack`); the same numbers to rounding."""
 
     def __init__(self, factors: Sequence[CorrelatedSighting]) -> None:
         laws = [factor.law for factor in factors]
-        self._sonars = np.array([law.body_T_sonar.matrix() for law in laws])
+        sonars = np.array([law.body_T_sonar.matrix() for law in laws])
         self._keys = [law.keys for law in laws]
         self._pose_keys = np.array([law.keys[0] for law in laws], np.uint64)
         self._landmark_keys = sorted({law.keys[1] for law in laws})
         self._landmark_of = np.searchsorted(
             self._landmark_keys, [law.keys[1] for law in laws]
         )
+        self._body_R_sonar = sonars[:, :3, :3]
+        self._body_p_sonar = sonars[:, :3, 3]
+        self._by_body = np.array([law.by_body for law in laws])
         self._z = np.array([law.z for law in laws])
         # a kernel wraps the noise whose square root whitens
         noises: list[Any] = [factor.noiseModel() for factor in factors]
@@ -148,56 +167,68 @@ class SightingStack:
 
     def error(self, values: gtsam.Values) -> float:
         """Sum of the kernels' losses."""
-        e, lengths, _, _ = self._views(values)
-        losses = 0.5 * np.vecdot(e, e)
+        view = self._views(values)
+        losses = 0.5 * np.vecdot(view.e, view.e)
         losses[self._robust] = [
-            kernel.loss(d) for kernel, d in zip(self._kernels, lengths, strict=True)
+            kernel.loss(d)
+            for kernel, d in zip(self._kernels, view.lengths, strict=True)
         ]
         return float(losses.sum())
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised, with the weight of its kernel."""
-        e, lengths, by_pose, by_landmark = self._views(values)
+        view = self._views(values)
         # a robust kernel multiplies rows and residuals by the root of its weight
-        root = np.ones((len(e), 1))
+        root = np.ones((len(view.e), 1))
         weights = [
-            kernel.weight(d) for kernel, d in zip(self._kernels, lengths, strict=True)
+            kernel.weight(d)
+            for kernel, d in zip(self._kernels, view.lengths, strict=True)
         ]
         root[self._robust, 0] = np.sqrt(weights)
-        W = root[..., None] * self._whitening
+        D_q = root[..., None] * self._whitening @ view.D_q  # (n, 2, 3)
+        q_x = -np.cross(view.q[:, None, :], np.eye(3))  # [q]x
+        by_pose = np.concatenate((D_q @ q_x, -D_q), axis=2) @ self._by_body  # (n, 2, 6)
+        by_landmark = D_q @ view.world_R_sonar.transpose(0, 2, 1)  # (n, 2, 3)
         return [
             gtsam.JacobianFactor(pose, A_pose, landmark, A_landmark, rhs, UNIT)
             for (pose, landmark), A_pose, A_landmark, rhs in zip(
-                self._keys, W @ by_pose, W @ by_landmark, -root * e, strict=True
+                self._keys, by_pose, by_landmark, -root * view.e, strict=True
             )
         ]
 
-    def _views(
-        self, values: gtsam.Values
-    ) -> tuple[Floats, list[float], Floats, Floats]:
-        """Whitened errors, shape (n, 2), lengths of those that have a kernel, and derivatives by pose and landmark."""
+    def _views(self, values: gtsam.Values) -> SightingViews:
+        """Every sighting at these values."""
+        poses = poses_of(values, self._pose_keys)
+        R = poses[:, :9].reshape(-1, 3, 3)
+        world_R_sonar = R @ self._body_R_sonar
+        world_p_sonar = poses[:, 9:] + times(R, self._body_p_sonar)
         # each landmark is read once, however many sightings it has
-        landmarks = np.array([values.atPoint3(key) for key in self._landmark_keys])
-        bodies = poses_of(values, self._pose_keys)
-        z, by_pose, by_landmark = views(
-            bodies, self._sonars, landmarks[self._landmark_of]
+        points = np.array([values.atPoint3(key) for key in self._landmark_keys])[
+            self._landmark_of
+        ]
+        q = times(world_R_sonar.transpose(0, 2, 1), points - world_p_sonar)
+        # the same model, for all sonars at once
+        predicted, D_q = project_points(np.ascontiguousarray(q))
+        e = times(self._whitening, polar_difference(predicted, self._z))
+        return SightingViews(
+            world_R_sonar, q, D_q, e, np.linalg.norm(e[self._robust], axis=1).tolist()
         )
-        e = (self._whitening @ polar_difference(z, self._z)[..., None])[..., 0]
-        lengths = np.linalg.norm(e[self._robust], axis=1).tolist()
-        return e, lengths, by_pose, by_landmark
 
 
 CorrelatedSighting.Stack = SightingStack
 
 
+def times(matrices: Floats, vectors: Floats) -> Floats:
+    """Product of each matrix with its vector."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
 def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:
-    """First three rows of the poses of a graph by the keys of keyframes, shape (...), as an array (..., 3, 4)."""
+    """Poses of a graph by the keys of keyframes, shape (...): rows of R, and p, shape (..., 12)."""
     known = np.fromiter(values.keys(), np.uint64)
     poses = np.asarray(gtsam.utilities.extractPose3(values))  # by ascending key
-    # the highest byte of a key is its letter; a row has those of R, then p
-    found = poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
-    R = found[..., :9].reshape(*keys.shape, 3, 3)
-    return np.concatenate((R, found[..., 9:, None]), axis=-1)
+    # the highest byte of a key is its letter
+    return poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
 
 
 def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
@@ -283,7 +314,7 @@ def landmark_sighting(
     cov: Floats,
     robust: Robust | None = None,
     elevation_sigma_rad: float | None = None,
-) -> dict[str, gtsam.NonlinearFactor]:
+) -> dict[str, gtsam.NoiseModelFactor]:
     """Range and azimuth of a landmark, by their labels in messages; all of them belong in the graph.
 
     Parameters
@@ -331,8 +362,11 @@ def landmark_sighting(
     both = CorrelatedSighting(
         pose_key, landmark_key, body_T_sonar, z, robust(gaussian(cov))
     )
-    of_elevation = {"elevation": camera} if elevation_sigma_rad else {}
-    return of_elevation | {"range and azimuth": both}
+    return (
+        {"elevation": camera, "range and azimuth": both}
+        if elevation_sigma_rad
+        else {"range and azimuth": both}
+    )
 
 
 def first_direction(

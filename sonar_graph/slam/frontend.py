@@ -6,15 +6,14 @@ For each frame (`Frontend.add`)::
     revise      earlier sightings whose identity the frame changes     policy decides, `LandmarkGraph` applies
     tie         set a keyframe if the frame needs a newer one          the frame hangs on it by odometry
     predict     range and azimuth of rivals, with covariances          from the newest keyframe of the window
-    judge       landmark of each detection, or a refusal               policy decides, `LandmarkGraph` applies
-                earlier sightings at the new estimate
+    decide      landmark of each detection, or a refusal               policy decides, `LandmarkGraph` applies
+    reconsider  earlier sightings at the new estimate                  policy decides, `LandmarkGraph` applies
 
 Every decision is a value. It is applied, and the estimate updated if that is due, before the policy decides again
 (docs/theory/identities.md, doubtful_identities.md, unknown_landmarks.md). Predictions: docs/theory/models.md.
 """
 
 from collections.abc import Set
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -24,8 +23,8 @@ from sonar_graph.models import KernelParams
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
     AmendableJournal,
-    Assignment,
     AssociatedUnknown,
+    Decision,
     Frame,
     IdentityParams,
     IdentityPolicy,
@@ -82,8 +81,8 @@ class Frontend:
         taken: set[int] = set()
         for policy, part in self._shared(frame):
             # first, so that the frame is compared with an estimate without the wrong identities
-            for decided in policy.revise(part):
-                self._apply(decided)
+            self._apply(policy.retract(part))
+            self._apply(policy.associate(part))
             if part is None:
                 continue
             newest = self._keyframes.tie(
@@ -94,16 +93,20 @@ class Frontend:
                     self._keyframes.set_for_frame(part.stamp_ns, newest.motion)
                 )
             seen = self._predicted(policy, part, newest, tie, frozenset(taken))
-            for decided in policy.judge(seen):
-                self._apply(decided)
-                # keyframes of sightings that wait stay in the window, so that late factors cost no restart
-                self.landmarks.smoother.hold(self.policy.held())
-                # only nameless detections, which come last, need to know
-                for each in decided if self._nameless is not None else ():
-                    landmark_id = self.landmarks.state(each.sighting).landmark_id
-                    # None where the smoother withheld the sighting
-                    if landmark_id is not None:
-                        taken.add(landmark_id)
+            decision = policy.judge(seen)
+            self._apply(decision)
+            # keyframes of sightings that wait stay in the window, so that late factors cost no restart
+            self.landmarks.smoother.hold(self.policy.held())
+            later = policy.reconsider()
+            while not later.is_empty:
+                self._apply(later)
+                later = policy.reconsider()
+            # only nameless detections, which come last, need to know
+            for each in decision.assignments if self._nameless is not None else ():
+                landmark_id = self.landmarks.state(each.sighting).landmark_id
+                # None where the smoother withheld the sighting
+                if landmark_id is not None:
+                    taken.add(landmark_id)
 
     def add_fix(self, stamp_ns: int, position_m: Floats, cov_m2: Floats) -> None:
         """Add a position fix, which enters the estimate at once if it adds enough information."""
@@ -122,7 +125,7 @@ class Frontend:
         for changed in changes:
             self._follow(changed)
         if changes:
-            self.landmarks.begin()
+            self.landmarks.begin(self._keyframes.newest_s)
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph, with the doubtful identities that fit it best."""
@@ -131,10 +134,7 @@ class Frontend:
     def log(self) -> DetectionLog:
         """Outcome of each detection in the same history."""
         self._forget(set())
-        journal = deepcopy(self.journal)  # the run goes on with its own
-        for each in self.policy.rechosen():
-            journal.amend(each)
-        return journal.log()
+        return self.landmarks.log(self.policy.rechosen())
 
     def _screened(self, detections: LandmarkDetections) -> Frame | None:
         """Detections that may become sightings. Every row enters the journal, a refused one with its reason."""
@@ -223,12 +223,15 @@ class Frontend:
         view = PredictedView(newest, world_T_keyframe, body_T_sonar, joint)
         return SeenFrame(frame, view, keys, tie, taken, self.landmarks.factors)
 
-    def _apply(self, decided: list[Assignment]) -> None:
-        """Apply assignments, if any, and update the estimate if that is due."""
-        if decided:
-            self.landmarks.apply(decided)
+    def _apply(self, decision: Decision) -> None:
+        """Apply each round of a decision, and update the estimate before the next."""
+        if decision.settles:
+            self.landmarks.settle(self._keyframes.newest_s)
+        for assignments in decision.rounds:
+            self.landmarks.apply(assignments, self._keyframes.newest_s)
             self.update_if_due()
-            self.landmarks.release()
+        if decision.released:
+            self.landmarks.release(decision.released, self._keyframes.newest_s)
 
     def _follow(self, changed: Changed) -> None:
         self.landmarks.follow(changed)
@@ -242,4 +245,4 @@ class Frontend:
             if policy is not None and (
                 given_up := policy.forget(self._keyframes.advanced_ns, left)
             ):
-                self.landmarks.apply(given_up)
+                self.landmarks.apply(given_up, self._keyframes.newest_s)

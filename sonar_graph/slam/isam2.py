@@ -11,8 +11,7 @@ One call of `Isam2.process`::
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from functools import partial
-from operator import itemgetter
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import gtsam
 import numpy as np
@@ -106,8 +105,11 @@ class Isam2Params(Section):
         return self
 
 
-Event = tuple[int, Callable[[], None]]
-"""Stamp of a frame or a fix, and the call that takes it in."""
+class Event(NamedTuple):
+    """A frame or a fix, and the call that takes it in."""
+
+    stamp_ns: int
+    apply: Callable[[], None]
 
 
 class Isam2:
@@ -149,10 +151,7 @@ class Isam2:
         self._poses = PoseHistory()
         range_sigma_m = calibration.sonar.range_sigma_m
         self._smoother = Smoother(
-            self._params.smoother,
-            self._params.history,
-            self._poses.leave,
-            range_sigma_m,
+            self._params.smoother, self._params.history, self._poses, range_sigma_m
         )
         self._keyframes = Keyframes(
             calibration, odometry, self._params.keyframes, self._smoother
@@ -190,22 +189,21 @@ class Isam2:
             measurements.imu, measurements.dvl, measurements.depth, measurements.heading
         )
         events = self._fix_events(measurements.positions)
-        newest_ns = self._poses.newest_ns
-        if newest_ns is not None and measurements.end_ns < newest_ns:
+        is_late = (
+            self._poses.newest_ns is not None
+            and measurements.end_ns < self._poses.newest_ns
+        )
+        if is_late:
             # a fix may be tied to an earlier keyframe, but the motion to an earlier frame is no longer kept
-            for _, take_in in events:
-                take_in()
+            for event in events:
+                event.apply()
             self._refuse_late(measurements.detections)
             return None
         # frames before fixes of the same stamp, because the sort is stable
-        detections = measurements.detections
-        frames: list[Event] = [
-            (int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
-            for frame in (detections.frames() if detections is not None else ())
-        ]
-        for stamp_ns, take_in in sorted(frames + events, key=itemgetter(0)):
-            self._frontend.advance(stamp_ns)
-            take_in()
+        events = self._frame_events(measurements.detections) + events
+        for event in sorted(events, key=lambda event: event.stamp_ns):
+            self._frontend.advance(event.stamp_ns)
+            event.apply()
         self._frontend.advance(measurements.end_ns)
         if self._keyframes.newest_ns is None:
             return None
@@ -222,13 +220,22 @@ class Isam2:
         joint = self._smoother.joint_covariance(instant.tie.keys)
         return instant.carried_on(self._smoother.estimates, joint)
 
+    def _frame_events(self, detections: LandmarkDetections | None) -> list[Event]:
+        """Frames of detections, each with the call that takes it in."""
+        if detections is None:
+            return []
+        return [
+            Event(int(frame.stamps_ns[0]), partial(self._frontend.add, frame))
+            for frame in detections.frames()
+        ]
+
     def _fix_events(self, positions: PositionFixes | None) -> list[Event]:
         """Valid position fixes, each with the call that adds it to the graph."""
         if positions is None:
             return []
         known = self._keyframes.calibration.positions
         is_sound = positions.are_sound()
-        events: list[Event] = []
+        events = []
         for k, stamp_ns in enumerate(positions.stamps_ns.tolist()):
             if not is_sound[k]:
                 self._keyframes.refuse("positions", stamp_ns, Refusal.UNSOUND)
@@ -237,8 +244,17 @@ class Isam2:
             # the receiver gave none: the calibration's noise holds
             if np.isnan(cov_m2).any():
                 cov_m2 = np.diag(np.square(known.sigma_m))
-            fix = (stamp_ns, positions.position_m[k], cov_m2)
-            events.append((stamp_ns, partial(self._frontend.add_fix, *fix)))
+            events.append(
+                Event(
+                    stamp_ns,
+                    partial(
+                        self._frontend.add_fix,
+                        stamp_ns,
+                        positions.position_m[k],
+                        cov_m2,
+                    ),
+                )
+            )
         return events
 
     def _refuse_late(self, detections: LandmarkDetections | None) -> None:
@@ -364,9 +380,11 @@ class Isam2:
                 raise EstimatorError(f"isam2: there is no keyframe {number}; {known}")
 
     def _require_landmarks(self, ids: list[int], over: Over) -> None:
-        known = self._frontend.landmarks.ids
-        if over == "history":
-            known = self._frontend.smoothed().ids
+        known = (
+            self._smoother.landmark_ids
+            if over == "window"
+            else self._frontend.smoothed().ids
+        )
         unknown = [landmark_id for landmark_id in ids if landmark_id not in set(known)]
         if unknown:
             listed = ", ".join(map(str, known[:MOST_LISTED])) + (
@@ -379,13 +397,17 @@ class Isam2:
     def _require_in_window(self, numbers: list[int]) -> None:
         """Refuse keyframes that have left a bounded window."""
         newest = self.keyframe_count - 1
-        for number in numbers:
-            if not self._smoother.in_window([X(number)]):
-                inside = (k for k in range(newest) if self._smoother.in_window([X(k)]))
-                raise EstimatorError(
-                    f"isam2: keyframe {number} has left the window, which holds {next(inside, newest)} to {newest};"
-                    ' none is known any more; history.policy = "whole" keeps all'
-                )
+        left = [
+            number for number in numbers if not self._smoother.in_window([X(number)])
+        ]
+        if left:
+            first = next(
+                (k for k in range(newest) if self._smoother.in_window([X(k)])), newest
+            )
+            raise EstimatorError(
+                f"isam2: keyframe {left[0]} has left the window, which holds {first} to {newest}; none is known any"
+                ' more; history.policy = "whole" keeps all'
+            )
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.
@@ -412,19 +434,18 @@ class Isam2:
         """
         smoother = self._smoother
         # a landmark that came with the last frame may wait for the next update
-        landmarks = self._frontend.landmarks
-        ids = [i for i in landmarks.ids if smoother.in_window([L(i)])]
-        return landmarks.known.with_given(
+        ids = [i for i in smoother.landmark_ids if smoother.in_window([L(i)])]
+        return self._frontend.landmarks.known.with_given(
             map_of(smoother.estimates, smoother.marginals, ids)
         )
 
     def known_map(self) -> KnownMap:
         """Landmarks after solving the whole graph, with their joint covariance, for another run."""
+        ids = self._smoother.landmark_ids
         found = self.landmarks()
-        joint = self.joint_covariance(landmarks=found.ids, over="history")
-        return KnownMap.of(
-            found.ids.tolist(), found.positions, covariance_m2=joint.matrix
-        )
+        rows = np.searchsorted(found.ids, ids)
+        joint = self.joint_covariance(landmarks=ids, over="history")
+        return KnownMap.of(ids, found.positions[rows], covariance_m2=joint.matrix)
 
     def detections(self) -> DetectionLog:
         """Outcome of each detection; of doubtful identities in the history of `trajectory`."""

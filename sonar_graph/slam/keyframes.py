@@ -120,8 +120,37 @@ class Linearisation(NamedTuple):
     """Shape (3,), rad/s."""
 
 
-def average_at_end(variance: Floats, wander: Floats) -> tuple[Floats, float]:
-    """Weights of samples in an average at the end of an interval, shape (n,), and its variance.
+class Interval(NamedTuple):
+    """Interval between two keyframes."""
+
+    start_ns: int
+    node_ns: int
+    known_ns: int
+    """No row stamped later is used."""
+
+
+def split_at(
+    blocks: list[Block], interval: Interval
+) -> tuple[Block | None, list[Block]]:
+    """Samples of an interval as one block, None without any, and the blocks of later samples."""
+    if not blocks:
+        return None, []
+    together = type(blocks[0]).concatenate(blocks)
+    inside = together.between(interval.start_ns, interval.node_ns)
+    later = together.between(interval.node_ns, LATEST_NS)
+    return inside, [] if later is None else [later]
+
+
+class Average(NamedTuple):
+    """Weighted average of samples at the end of an interval."""
+
+    weights: Floats
+    """Their sum is 1, shape (n,)."""
+    variance: float
+
+
+def average_at_end(variance: Floats, wander: Floats) -> Average:
+    """Weights of samples in an average at the end of an interval, and its variance.
 
     Samples are carried to the end by odometry, whose error is a random walk that all older samples share; a sample's
     own noise is white. The best weights are those of a Kalman filter for a random walk without a prior::
@@ -144,7 +173,7 @@ def average_at_end(variance: Floats, wander: Floats) -> tuple[Floats, float]:
     # older samples share the odometry's error: they give way together
     weights = np.array(gains)
     weights[:-1] *= np.cumprod(1.0 - weights[:0:-1])[::-1]
-    return weights, P
+    return Average(weights, P)
 
 
 class Keyframes:
@@ -193,8 +222,7 @@ class Keyframes:
         lag_s = min(smoother.params.lag_s, LONGEST_LATE_S)
         self._lag_ns = round(lag_s * NS_PER_S)
         self._bias_since_ns = 0
-        self.newest_key = X(0)
-        """Key of the newest keyframe."""
+        self._newest_key = X(0)
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._linearised: Linearisation
         self._depths: list[Depth] = []
@@ -209,6 +237,16 @@ class Keyframes:
     def newest_ns(self) -> int | None:
         """Stamp of the newest keyframe; None before the first."""
         return self.stamps_ns[-1] if self.stamps_ns else None
+
+    @property
+    def newest_s(self) -> float:
+        """Stamp of the newest keyframe in seconds, as the smoother counts them."""
+        return self.stamps_ns[-1] * S_PER_NS
+
+    @property
+    def newest_key(self) -> int:
+        """Key of the newest keyframe."""
+        return self._newest_key
 
     def tie(self, motion: PreintegratedMotion) -> Tie:
         """An instant that the motion from the newest keyframe leads to."""
@@ -273,11 +311,12 @@ class Keyframes:
     @property
     def refused(self) -> list[RefusedRow]:
         """Rows of all sensors but the sonar that are not used, and why; rows before the start do not count as late."""
-        return self.odometry.refused + [
+        own = [
             row
             for row in self._refused
             if row.reason is not Refusal.LATE or row.stamp_ns >= self._reached_ns
         ]
+        return self.odometry.refused + own
 
     # ---------------------------------------------------------------- keyframes
 
@@ -307,7 +346,7 @@ class Keyframes:
         return changes
 
     def _updated(self) -> Changed:
-        changed = self.smoother.update()
+        changed = self.smoother.update(self.newest_s)
         self._linearise()  # at the estimate that contains the new keyframe
         return changed
 
@@ -380,11 +419,11 @@ class Keyframes:
         )
         self._add_odometry(i, motion, linearisation)
         self._add_gravity(j, node_ns, motion)
-        self._add_averages(j, node_ns, known_ns, linearisation)
+        self._add_averages(j, Interval(start_ns, node_ns, known_ns), linearisation)
         # the factors up to here hold for the biases of keyframe i
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
-        self.newest_key = X(j)
+        self._newest_key = X(j)
         self._constrain(j)
         self.odometry.settle(node_ns)
         # a late fix may need the motion from any keyframe of the lag
@@ -412,7 +451,11 @@ class Keyframes:
 
     def update_if_due(self) -> Changed | None:
         """Update the smoother when what was added since its last update would change the estimate."""
-        return self.smoother.update() if self.smoother.is_due else None
+        return self.smoother.update(self.newest_s) if self.smoother.is_due else None
+
+    def bias(self, index: int) -> Floats:
+        """Newest estimate of the biases that hold from a keyframe on, shape (11,)."""
+        return np.asarray(self.smoother.estimates.atVector(self.bias_keys[index]))
 
     # ---------------------------------------------------------------- motion
 
@@ -456,7 +499,7 @@ class Keyframes:
 
     def _linearisation(self, i: int) -> Linearisation:
         """Where motions from keyframe i are linearised now."""
-        biases = np.asarray(self.smoother.estimates.atVector(self.bias_keys[i]))
+        biases = self.bias(i)
         attitude = self.smoother.estimates.atPose3(X(i)).rotation().matrix()
         up = attitude[2] if self.calibration.use_gravity else np.zeros(3)
         gyro_bias = np.array(gyro_bias_of(biases, vec(up)))
@@ -509,40 +552,31 @@ class Keyframes:
         self.smoother.add({"gravity": gravity})
 
     def _add_averages(
-        self, j: int, node_ns: int, known_ns: int, linearisation: Linearisation
+        self, j: int, interval: Interval, linearisation: Linearisation
     ) -> None:
         """Add one factor for the depths since the last keyframe, and one for the headings."""
         gyro_bias = linearisation.gyro_bias
-        depths = self._taken(self._depths, node_ns)
+        depths, self._depths = split_at(self._depths, interval)
         if depths is not None:
-            carried = self._carried(depths.stamps_ns, node_ns, known_ns, gyro_bias)
+            carried = self._carried(depths.stamps_ns, interval, gyro_bias)
             self._add_depth(j, depths, carried)
-        headings = self._taken(self._headings, node_ns)
+        headings, self._headings = split_at(self._headings, interval)
         if headings is not None:
-            carried = self._carried(headings.stamps_ns, node_ns, known_ns, gyro_bias)
+            carried = self._carried(headings.stamps_ns, interval, gyro_bias)
             self._add_heading(j, headings, carried, linearisation.biases[COMPASS])
 
-    def _taken(self, blocks: list[Block], node_ns: int) -> Block | None:
-        """Samples since the last keyframe, which leave the list; None without any."""
-        if not blocks:
-            return None
-        together = type(blocks[0]).concatenate(blocks)
-        later = together.between(node_ns, LATEST_NS)
-        blocks[:] = [] if later is None else [later]
-        return together.between(self.stamps_ns[-1], node_ns)
-
     def _carried(
-        self, stamps_ns: Ints, node_ns: int, known_ns: int, gyro_bias: Floats
+        self, stamps_ns: Ints, interval: Interval, gyro_bias: Floats
     ) -> Carried:
-        """Motions from samples to the keyframe after them, by rows stamped no later than ``known_ns``."""
-        until_ns = np.append(stamps_ns[1:], node_ns)
-        known = np.full(len(stamps_ns), known_ns)
+        """Motions from samples to the keyframe after them."""
+        until_ns = np.append(stamps_ns[1:], interval.node_ns)
+        known_ns = np.full(len(stamps_ns), interval.known_ns)
         # the keyframe is an epoch: a gap before it has a velocity on both sides
         motions = self.odometry.motions(
-            stamps_ns, until_ns, known, gyro_bias, over_gaps=True
+            stamps_ns, until_ns, known_ns, gyro_bias, over_gaps=True
         )
         # what is left of the gyro bias turns old samples more: b^2 t^2, of which each motion has the growth
-        age_s = np.append(node_ns - stamps_ns, 0) * S_PER_NS
+        age_s = np.append(interval.node_ns - stamps_ns, 0) * S_PER_NS
         by_bias_rad2 = self.calibration.imu.gyro_bias_sigma**2 * -np.diff(age_s**2)
         motions.C[:, :3, :3] += by_bias_rad2[:, None, None] * np.eye(3)
         return Carried(*until_last(motions.dR, motions.dp), motions.C)
@@ -554,16 +588,19 @@ class Keyframes:
         ups = carried.k_R_j[1:] @ up_j  # (n, 3)
         of_ups = carried.C[:, 3:, 3:] @ ups[:, :, None]  # (n, 3, 1)
         wander_m2 = np.vecdot(ups, of_ups[:, :, 0])
+        z_m = depth.z_m
         given_m2 = depth.variance_m2
         variance_m2 = np.where(
             np.isnan(given_m2), self.calibration.depth.sigma_m**2, given_m2
         )
-        weights, mean_m2 = average_at_end(variance_m2, wander_m2)
+        average = average_at_end(variance_m2, wander_m2)
         port = np.array(self.calibration.depth.port_m)
         ports = ((port - carried.k_p_j[:-1])[:, None] @ carried.k_R_j[:-1])[:, 0]
-        height_m = float(weights @ depth.z_m)
-        factor = factors.depth(X(j), height_m, weights @ ports, mean_m2**0.5)
-        self.smoother.add({"depth": factor})
+        height_m = float(average.weights @ z_m)
+        sigma_m = average.variance**0.5
+        self.smoother.add(
+            {"depth": factors.depth(X(j), height_m, average.weights @ ports, sigma_m)}
+        )
 
     def _add_heading(
         self, j: int, heading: Heading, carried: Carried, compass_rad: float
@@ -586,11 +623,11 @@ class Keyframes:
             HUBER_WIDTHS[1] * sigma_rad
         )
         # beyond k sigma the noise grows with the error: R d / k
-        weights, mean_rad2 = average_at_end(
-            sigma_rad**2 * np.maximum(1.0, off), wander_rad2
+        average = average_at_end(sigma_rad**2 * np.maximum(1.0, off), wander_rad2)
+        measured_rad = float(yaw_rad[-1] + compass_rad + average.weights @ innovation)
+        factor = factors.heading(
+            X(j), self.bias_keys[-1], measured_rad, average.variance**0.5
         )
-        measured_rad = float(yaw_rad[-1] + compass_rad + weights @ innovation)
-        factor = factors.heading(X(j), self.bias_keys[-1], measured_rad, mean_rad2**0.5)
         self.smoother.add({"heading": factor})
         bias_sigma_rad = self.calibration.heading.bias_sigma_rad
 
@@ -642,13 +679,15 @@ class Keyframes:
         by_biases_m2 = D * np.square(self._bias_sigmas) @ D.T  # (3, 3)
         # beside the estimate at the keyframe the biases of the motion to the fix are an error too
         spread_m2 = noise_m2 + by_biases_m2
-        factor = factors.position(X(i), position_m, arm, noise_m2)
+        factor: gtsam.NonlinearFactor
         share = by_biases_m2.diagonal() / noise_m2.diagonal()
         if (share > LEAST_BIAS_SHARE).any():
             keys = (X(i), self.bias_keys[i])
             factor = factors.position_with_biases(
                 keys, position_m, motion, antenna, noise_m2
             )
+        else:
+            factor = factors.position(X(i), position_m, arm, noise_m2)
         gain = np.inf  # enters at once
         if i == len(self.stamps_ns) - 1 and not self.smoother.is_due:
             by_pose = body_point_jacobian(world_R_i, arm)

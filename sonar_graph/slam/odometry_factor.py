@@ -44,10 +44,8 @@ from sonar_graph.numerics import (
     curvature,
     exp_and_mean,
     inlined,
-    mat,
     mat6,
     outer,
-    position,
     rodrigues,
     rotation_log,
     skew,
@@ -64,22 +62,38 @@ UNWHITENED = np.eye(6)[None]
 class OdometryError:
     """Error of one factor, called by GTSAM."""
 
-    __slots__ = ("D", "_motion", "_result", "bias_0", "h", "i_T_j", "keys")
+    __slots__ = (
+        "D",
+        "_R",
+        "_motion",
+        "_p",
+        "_poses",
+        "_result",
+        "bias_0",
+        "h",
+        "i_T_j",
+        "keys",
+    )
 
     def __init__(
         self, keys: tuple[int, int, int], motion: PreintegratedMotion, up_j: Floats
     ) -> None:
         self.keys = keys
         self.bias_0 = motion.bias
-        self.i_T_j = np.ascontiguousarray(motion.i_T_j.matrix()[:3])  # (3, 4)
+        i_R_j = motion.i_T_j.rotation().matrix()
+        # (12,)
+        self.i_T_j = np.concatenate((i_R_j.ravel(), motion.i_T_j.translation()))
         self.h = np.zeros(motion.D_bias.shape[1])
         self.h[HEADING] = up_j @ motion.D_bias[:3, HEADING]
         self.D = motion.D_bias.copy()
         # the turn about the vertical is psi's alone
         self.D[:3] -= np.outer(up_j, self.h)
         self._motion = (self.i_T_j[None], self.D[None], self.h[None], UNWHITENED)
-        # GTSAM calls thousands of times: results are written into arrays made once
-        self._result = to_be_filled(1, len(self.h))
+        # GTSAM calls thousands of times: poses are written into arrays made once
+        self._poses = np.empty((2, 1, 12))
+        self._R = self._poses[:, 0, :9].reshape(2, 3, 3)
+        self._p = self._poses[:, 0, 9:]
+        self._result = OdometryDerivatives.empty(1, len(self.h))
 
     def __call__(
         self,
@@ -88,18 +102,20 @@ class OdometryError:
         jacobians: list[Floats] | None,
     ) -> Floats:
         """Error, shape (6,), unwhitened."""
-        key_i, key_j, bias_key = self.keys
-        # (1, 3, 4) each
-        X_i = np.ascontiguousarray(values.atPose3(key_i).matrix()[None, :3])
-        X_j = np.ascontiguousarray(values.atPose3(key_j).matrix()[None, :3])
-        change = (values.atVector(bias_key) - self.bias_0)[None]  # (1, 11)
+        for k in range(2):
+            world_T_body = values.atPose3(self.keys[k]).matrix()  # (4, 4)
+            self._R[k] = world_T_body[:3, :3]
+            self._p[k] = world_T_body[:3, 3]
+        X_i, X_j = self._poses  # (1, 12) each
+        change = (values.atVector(self.keys[2]) - self.bias_0)[None]  # (1, 11)
         if jacobians is None:
             return odometry_errors(X_i, X_j, change, self._motion)[0]
-        write_derivatives(X_i, X_j, change, self._motion, self._result)
-        errors, *columns = self._result
-        for k, transposed in enumerate(columns):
-            jacobians[k] = transposed[0].T  # back to rows
-        return errors[0]
+        found = self._result
+        write_derivatives(X_i, X_j, change, self._motion, (*found,))
+        jacobians[0] = found.by_i[0].T  # back to rows
+        jacobians[1] = found.by_j[0].T
+        jacobians[2] = found.by_b[0].T
+        return found.errors[0]
 
 
 class OdometryWithBias(gtsam.CustomFactor):
@@ -127,27 +143,35 @@ class OdometryWithBias(gtsam.CustomFactor):
 
 
 BiasedMotions = tuple[Floats, Floats, Floats, Floats]
-"""Constants of n motions: i_T_j, shape (n, 3, 4); D, shape (n, 6, 11); h, shape (n, 11); W with ``W C W^T = I``,
+"""Constants of n motions: rows of R, and p, shape (n, 12); D, shape (n, 6, 11); h, shape (n, 11); W with ``W C W^T = I``,
 shape (n, 6, 6)."""
 
 
-OdometryDerivatives = tuple[Floats, Floats, Floats, Floats]
-"""Errors of n motions, shape (n, 6), and their derivatives, transposed: by the first pose and by the second, shape
-(n, 6, 6), and by b, shape (n, 11, 6)."""
+class OdometryDerivatives(NamedTuple):
+    """Errors of n motions, and their derivatives, transposed."""
 
+    errors: Floats
+    """Shape (n, 6)."""
+    by_i: Floats
+    """By the first pose, shape (n, 6, 6)."""
+    by_j: Floats
+    """By the second pose, shape (n, 6, 6)."""
+    by_b: Floats
+    """By b, shape (n, 11, 6)."""
 
-def to_be_filled(n: int, biases: int) -> OdometryDerivatives:
-    """Arrays for the derivatives of n motions."""
-    return (
-        np.empty((n, 6)),
-        np.empty((n, 6, 6)),
-        np.empty((n, 6, 6)),
-        np.empty((n, biases, 6)),
-    )
+    @classmethod
+    def empty(cls, n: int, biases: int) -> OdometryDerivatives:
+        """Arrays to be filled."""
+        return cls(
+            np.empty((n, 6)),
+            np.empty((n, 6, 6)),
+            np.empty((n, 6, 6)),
+            np.empty((n, biases, 6)),
+        )
 
 
 class OdometryStack:
-    """Many `OdometryWithBias`, evaluated as arrays (`batch_solution.StackedGraph`); the same numbers to rounding."""
+    """Many `OdometryWithBias`, evaluated together as arrays (`batch_solution.Stack`); the same numbers to rounding."""
 
     def __init__(self, factors: Sequence[OdometryWithBias]) -> None:
         laws = [factor.law for factor in factors]
@@ -173,8 +197,8 @@ class OdometryStack:
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised."""
-        found = to_be_filled(*self._motions[2].shape)
-        write_derivatives(*self._states(values), self._motions, found)
+        found = OdometryDerivatives.empty(*self._motions[2].shape)
+        write_derivatives(*self._states(values), self._motions, (*found,))
         e, *columns = found
         # stored by columns, as GTSAM stores them
         blocks = (transposed.transpose(0, 2, 1) for transposed in columns)
@@ -186,7 +210,7 @@ class OdometryStack:
         ]
 
     def _states(self, values: gtsam.Values) -> tuple[Floats, Floats, Floats]:
-        """Poses at both ends, shape (n, 3, 4) each, and ``b - b_0``, shape (n, 11)."""
+        """Poses at both ends, as rows of R, and p, shape (n, 12) each, and ``b - b_0``, shape (n, 11)."""
         X_i, X_j = poses_of(values, self._pose_keys)
         # many motions share the biases of a stretch: each is read once
         biases = np.array([values.atVector(key) for key in self._bias_keys])
@@ -216,7 +240,7 @@ def write_derivatives(
     X_j: Floats,
     changes: Floats,
     motions: BiasedMotions,
-    linear: OdometryDerivatives,
+    linear: tuple[Floats, Floats, Floats, Floats],
 ) -> None:
     """As `odometry_errors`; fills the arrays of `OdometryDerivatives`."""
     i_T_j, D, h, whitening = motions
@@ -278,9 +302,9 @@ def evaluated(
     X_i: Floats, X_j: Floats, change: Floats, mean: Floats, D: Floats, h: Floats
 ) -> Evaluated:
     """Error (1) of one motion."""
-    R_i = mat(X_i)
-    R_j = mat(X_j)
-    R_m = mat(mean)
+    R_i, p_i = pose(X_i)
+    R_j, p_j = pose(X_j)
+    R_m, p_m = pose(mean)
     tilt = ZERO
     chord = ZERO
     psi = 0.0
@@ -292,12 +316,18 @@ def evaluated(
     way = V @ chord  # Exp(c) = (Exp(tilt), V chord)
     up = R_j.z  # the last row of R_j: the world's vertical in body j
     turn = exp_and_mean(-psi * up)[0]
-    turned = Transform(R_i.T @ R_j @ turn, R_i.T @ (position(X_j) - position(X_i)))
-    corrected = Transform(R_m @ exp_tilt, R_m @ way + position(mean))  # i_T_j Exp(c)
+    turned = Transform(R_i.T @ R_j @ turn, R_i.T @ (p_j - p_i))
+    corrected = Transform(R_m @ exp_tilt, R_m @ way + p_m)  # i_T_j Exp(c)
     E = Transform(corrected.R.T @ turned.R, corrected.R.T @ (turned.p - corrected.p))
     theta = rotation_log(E.R)
     e = Vec6(theta, chord_inverse(theta) @ E.p)  # (5)
     return Evaluated(e, E, turned, tilt, way, turn, up)
+
+
+@inlined
+def pose(rows: Floats) -> Transform:
+    """Transform from the rows of R, and p, shape (12,)."""
+    return Transform(Mat3(vec(rows[:3]), vec(rows[3:6]), vec(rows[6:9])), vec(rows[9:]))
 
 
 @inlined

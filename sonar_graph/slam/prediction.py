@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models import Mount, polar_difference, sight_of, views
+from sonar_graph.models import Mount, sight_of, wrap_angle
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import (
     LOWER_LEFT,
@@ -41,7 +41,6 @@ from sonar_graph.numerics import (
     innovation_of,
     mat,
     mat6,
-    position,
     row_of,
     skew,
     store,
@@ -52,8 +51,6 @@ from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
 from sonar_graph.states import Estimate, Trajectory
 
 TRIANGLE = np.tril_indices(6)
-AXES = np.arange(2)
-"""Range and azimuth, as rows and columns of a diagonal."""
 NO_BIASES = np.zeros((6, 0))
 """D of a motion that does not depend on biases."""
 
@@ -247,8 +244,9 @@ class PredictedView:
         Points, shape (m, 3), m, and the variance of their world z by keyframe and motion, shape (m,), m². The gyro bias
         is left out: it turns mostly about the vertical.
         """
-        pose_key = self._tie.pose_key
-        P = np.ascontiguousarray(self._covariance.at(pose_key, pose_key))
+        joint = self._covariance
+        row = joint.rows[self._tie.pose_key]
+        P = np.ascontiguousarray(joint.matrix[row : row + 6, row : row + 6])
         points = np.empty((len(z), 3))
         variance = np.empty(len(z))
         covariances = (P, self._tie.motion.covariance)
@@ -292,7 +290,7 @@ class PredictedView:
         self, keys: list[int], points: Floats, z: Floats, cov: Floats
     ) -> Compared:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
-        return weigh(z, *self.expect(keys, points), cov)
+        return weigh(z, *self.expect_jointly(keys, points, []), cov)
 
     def blurred(
         self, cov: Floats, motion: PreintegratedMotion, points: Floats
@@ -301,10 +299,8 @@ class PredictedView:
 
         Only the variances grow. The motion also correlates range and azimuth a little, which is left out.
         """
-        body, sonar = (np.array([T], order="C") for T in self._sonar)
-        _, H_M, _ = views(body, sonar, points)
         noise = cov.copy()
-        noise[:, AXES, AXES] += np.einsum("kia,ab,kib->ki", H_M, motion.covariance, H_M)
+        blur(self._sonar, motion.covariance, points, noise)
         return noise
 
 
@@ -323,13 +319,40 @@ def with_sources(covariance: JointCovariance, sources: list[Source]) -> Floats:
     return np.block([[P, of_both.T], [of_both, of_both @ by_variables.T + own]])
 
 
-def weigh(z: Floats, expected: Floats, P: Floats, cov: Floats) -> Compared:
-    """Compare m detections and their noise with the expectations and their covariances, shape (m, 2, 2)."""
-    e = polar_difference(z, expected)
-    S = P + cov
-    distance = np.vecdot(e, np.linalg.solve(S, e[..., None])[..., 0])
-    gain = (P[:, AXES, AXES] / cov[:, AXES, AXES]).max(axis=1)
-    return Compared(e, S, distance, gain)
+def weigh(z: Floats, expected: Floats, joint: Floats, cov: Floats) -> Compared:
+    """Compare m detections and their noise with the expectation and its joint covariance, shape (2 m, 2 m)."""
+    m = len(z)
+    found = Compared(np.empty((m, 2)), np.empty((m, 2, 2)), np.empty(m), np.empty(m))
+    write_compared(z, expected, joint, cov, (*found,))
+    return found
+
+
+@compiled
+def write_compared(
+    z: Floats,
+    expected: Floats,
+    joint: Floats,
+    cov: Floats,
+    found: tuple[Floats, Floats, Floats, Floats],
+) -> None:
+    """Fill the columns of `Compared`."""
+    innovation, S, distance, gain = found
+    for k in range(len(z)):
+        r = z[k, 0] - expected[k, 0]
+        alpha = wrap_angle(z[k, 1] - expected[k, 1])
+        innovation[k, 0] = r
+        innovation[k, 1] = alpha
+        for i in range(2):
+            for j in range(2):
+                S[k, i, j] = joint[2 * k + i, 2 * k + j] + cov[k, i, j]
+        a = S[k, 0, 0]
+        b = S[k, 0, 1]
+        c = S[k, 1, 1]
+        # e' S^-1 e with the closed inverse of a 2 x 2 matrix
+        squares = c * r**2 - 2.0 * b * r * alpha + a * alpha**2
+        distance[k] = squares / (a * c - b**2)
+        of_range = joint[2 * k, 2 * k] / cov[k, 0, 0]
+        gain[k] = max(of_range, joint[2 * k + 1, 2 * k + 1] / cov[k, 1, 1])
 
 
 @inlined
@@ -414,6 +437,18 @@ def expected_views(
 
 
 @compiled
+def blur(sonar: SonarOnBody, C: Floats, points: Floats, noise: Floats) -> None:
+    """Add to the noise of range and azimuth of points, (m, 2, 2), their variances by the covariance C of the body."""
+    world_T_body, body_T_sonar = sonar
+    mount = Mount(body_T_sonar, body_T_sonar[:3, 3])
+    for k in range(len(points)):
+        point = row_of(points, k)
+        sight = sight_of(mat(world_T_body), position(world_T_body), mount, point)
+        noise[k, 0, 0] += sight.range_by_body @ (mat6(C) @ sight.range_by_body)
+        noise[k, 1, 1] += sight.azimuth_by_body @ (mat6(C) @ sight.azimuth_by_body)
+
+
+@compiled
 def write_beams(
     sonar: SonarOnBody,
     world_T_keyframe: Floats,
@@ -433,6 +468,12 @@ def write_beams(
         h = height_by_body(world_T_keyframe, point)
         h_M = height_by_body(world_T_body, point)
         variance[k] = h @ (mat6(P) @ h) + h_M @ (mat6(Q) @ h_M)
+
+
+@inlined
+def position(T: Floats) -> Vec3:
+    """Position of a pose of shape (4, 4)."""
+    return Vec3(T[0, 3], T[1, 3], T[2, 3])
 
 
 @inlined

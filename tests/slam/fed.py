@@ -81,7 +81,7 @@ def on_the_rail(
                 )
             fed.add(ranged(k, i, distance, None if i in seen else 3e-4))
             seen.add(i)
-        fed.smoother.update()
+        fed.smoother.update(k * STEP_S)
     return fed
 
 
@@ -157,5 +157,5 @@ def in_the_basin(
                     X(k), L(i), SONAR, z, R, kernel, elevation_sigma
                 )
             )
-        fed.smoother.update()
+        fed.smoother.update(float(k))
     return fed

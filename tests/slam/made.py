@@ -84,10 +84,7 @@ def smoother_with(
         waiting_gain=waiting_gain,
     )
     return Smoother(
-        params,
-        BoundedHistory() if is_bounded else WholeHistory(),
-        PoseHistory().leave,
-        np.inf,
+        params, BoundedHistory() if is_bounded else WholeHistory(), PoseHistory()
     )
 
 

@@ -14,11 +14,11 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.prediction import AnchoredPose, Tie
 from sonar_graph.slam.smoother import JointCovariance
-from sonar_graph.states import FIRST_ANONYMOUS_ID
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.testing.numerical import central_differences
 
 from .graphs import dense_covariance, factors_of, gtsams_solution, off_sigmas
-from .late_identities import run
+from .late_identities import assert_outcomes_account, run
 from .made import random_covariance, some_motion, values_of
 from .rail import STEP_S, rail
 
@@ -99,6 +99,17 @@ def test_over_the_history_it_is_the_inverse_of_the_whole_information():
     assert np.array_equal(found.at(L(5), X(2)), found.matrix[3:6, 12:18])
 
 
+def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
+    estimator = ran(5.0, "bounded")
+    newest = len(estimator.keyframe_stamps()) - 1
+    values = gtsams_solution(estimator.graph, estimator.values)
+    found = estimator.joint_covariance([newest], (), [5, 2], over="history")
+    expected = dense(estimator, values, [L(2), L(5), X(newest)])
+    assert off_sigmas(found.matrix, expected) < 1e-4
+    of_window = estimator.joint_covariance([newest], (), [5, 2]).matrix
+    assert off_sigmas(of_window, found.matrix) < 0.05
+
+
 def test_a_keyframe_is_known_by_its_stamp_as_by_its_number():
     estimator = ran(5.0)
     stamps = estimator.keyframe_stamps()
@@ -145,6 +156,8 @@ def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(
     asked: dict, said: str
 ):
     estimator = ran(5.0, "bounded" if asked.get("over") == "history" else "whole")
+    if asked.get("stamp_ns") == "after the second":
+        asked = {"stamp_ns": int(estimator.keyframe_stamps()[1]) + 1}
     is_joint = asked.keys() & {"landmarks", "keyframes", "stamps_ns"}
     with pytest.raises(EstimatorError, match=f"^isam2: {said}") as caught:
         (estimator.joint_covariance if is_joint else estimator.marginal)(**asked)
@@ -163,3 +176,26 @@ def test_names_of_landmarks_without_names_are_refused_where_these_begin():
     ):
         run(named, 1 / STEP_S, identity__unknown__policy="associate")
     assert FIRST_ANONYMOUS_ID in run(named, 1 / STEP_S).landmarks().ids
+
+
+@pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture"])
+@pytest.mark.parametrize("range_m", [1.1e5, 1e200])
+def test_a_range_beyond_any_sonar_is_refused_and_changes_nothing(
+    policy: str, range_m: float
+):
+    sequence, _ = rail(8)
+    seen = sequence.detections
+    far = seen.range_m.copy()
+    far[3] = range_m
+    estimator = run(
+        replace(sequence, detections=replace(seen, range_m=far)),
+        1 / STEP_S,
+        identity__policy=policy,
+    )
+    assert assert_outcomes_account(estimator, sequence)[Outcome.UNSOUND] == 1
+    without = replace(sequence, detections=seen.rows(np.arange(len(seen)) != 3))
+    known = run(without, 1 / STEP_S, identity__policy=policy)
+    assert np.array_equal(estimator.landmarks().positions, known.landmarks().positions)
+    assert np.array_equal(
+        estimator.trajectory().positions, known.trajectory().positions
+    )

@@ -21,6 +21,7 @@ from sonar_graph.testing import check_jacobians
 from .graphs import information
 from .made import (
     POSES,
+    graph_of,
     plain,
     random_covariance,
     some_motion,
@@ -183,6 +184,28 @@ def test_derivatives_are_those_of_differences(
         )
 
 
+def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
+    """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
+    motion = some_motion(2, 0.05)
+    pose = POSES["random"]
+    bias = 0.01 * np.arange(-5.0, 6.0)
+    perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
+    X_j = pose.compose(motion.i_T_j).compose(
+        gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias))
+    )
+    factor = OdometryWithBias(X(0), X(1), B(0), motion)
+    assert np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=bias)), 0, atol=1e-12
+    )
+    off = X_j.compose(gtsam.Pose3.Expmap(perturbation))
+    assert np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation
+    )
+    assert not np.allclose(
+        factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3
+    )
+
+
 def test_a_heading_bias_turns_about_the_estimated_vertical():
     """Where the tilt is estimated otherwise than when the motion was set, too: then it never is a tilt for gravity."""
     motion = some_motion(2, 0.05)
@@ -265,6 +288,43 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
 
 
 @poses
+def test_depth_is_the_height_of_the_port_and_nothing_else(pose):
+    port = np.array([0.3, -0.2, 0.1])
+    sigma = 0.02
+    height = float(
+        Rotation.from_matrix(pose.rotation().matrix()).apply(port)[2]
+        + pose.translation()[2]
+    )
+    factor = factors.depth(X(0), height - 0.05, port, sigma)
+    values = values_of(X0=pose)
+    assert factor.whitenedError(values)[2] == pytest.approx(0.05 / sigma)
+    assert np.abs(factor.whitenedError(values)[:2]).max() < 1e-3
+    eigenvalues = np.linalg.eigvalsh(information([factor], values, [X(0)]))
+    assert eigenvalues[-1] > 1 / sigma**2 > 1e9 * eigenvalues[-2]
+
+
+@poses
+@given(roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
+@settings(max_examples=10)
+def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch):
+    sigma = 0.01
+    up_in_body = pose.rotation().matrix().T @ [0, 0, 1.0]
+    truth = factors.gravity_direction(X(0), 9.8 * up_in_body, sigma)
+    assert np.allclose(truth.unwhitenedError(values_of(X0=pose)), 0, atol=1e-12)
+    yawed = gtsam.Pose3(gtsam.Rot3.Rz(1.3).compose(pose.rotation()), pose.translation())
+    assert np.allclose(truth.unwhitenedError(values_of(X0=yawed)), 0, atol=1e-12)
+    tilted = values_of(
+        X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3)))
+    )
+    angle = np.arccos(
+        np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1)
+    )
+    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(
+        2 * np.sin(angle / 2) / sigma, abs=1e-5
+    )
+
+
+@poses
 def test_a_gravity_direction_that_does_not_fit_leaves_the_yaw_free(pose):
     """GTSAM's factor with both directions in the world has the residual's square."""
     sigma = 0.01
@@ -292,6 +352,10 @@ def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
     pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
     said = information(factors.planar(X(0), PLANE).values(), values_of(X0=pose), [X(0)])
     assert np.diag(said) == pytest.approx([2500, 2500, 0, 0, 0, 1e4], abs=1e-6)
+    graph = graph_of(factors.planar(X(0), PLANE).values())
+    assert graph.error(values_of(X0=pose)) < 1e-6
+    off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
+    assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
 
 
 def assert_is_each_of(made, stack, values: gtsam.Values) -> None:

@@ -26,7 +26,7 @@ def dive_with(smoother: Smoother | None = None, **changes) -> Dive:
 
 def settle(dive: Dive, updates: int = 1) -> None:
     for _ in range(updates):
-        dive.smoother.update()
+        dive.smoother.update(dive.keyframes.newest_s)
 
 
 def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
+from scipy.stats import chi2
 
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.estimator import make_params
@@ -20,7 +21,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate
-from sonar_graph.testing import check_consistent, laws
+from sonar_graph.testing import check_consistent, laws, small_world, still_world
 
 from .graphs import gtsams_solution
 from .made import isam2_params, ran
@@ -31,6 +32,14 @@ BASIN_S = 130.0
 @pytest.fixture(scope="module")
 def basin() -> Sequence:
     return simulate_basin(BasinOptions(duration_s=BASIN_S, laps=1, seed=3))
+
+
+def same(one: Estimate, other: Estimate) -> bool:
+    return (
+        one.stamp_ns == other.stamp_ns
+        and np.array_equal(one.world_T_body.matrix(), other.world_T_body.matrix())
+        and np.array_equal(one.covariance, other.covariance)
+    )
 
 
 def until(sequence: Sequence, end_ns: int) -> Sequence:
@@ -115,6 +124,15 @@ def test_the_final_answer_is_the_batch_solution(basin):
     assert estimator.values.equals(before, 0.0)
 
 
+@pytest.mark.parametrize("cut_s", [17.3, 64.0])
+def test_nothing_peeks_ahead(basin, cut_s):
+    """Estimates until t are the same, to the bit, from a log that ends at t."""
+    end_ns = basin.start_ns + round(cut_s * NS_PER_S)
+    whole, cut = (ran(s)[1] for s in (basin, until(basin, end_ns)))
+    assert len(cut) > 25
+    assert all(same(a, b) for a, b in zip(whole, cut[:-1], strict=False))
+
+
 def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
     truth = sequence.truth.at(np.array([e.stamp_ns for e in estimates]))
     off = np.array([e.world_T_body.translation() for e in estimates]) - truth.positions
@@ -124,6 +142,17 @@ def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
         for R, e in zip(rotations, estimates, strict=True)
     ]
     return normalised_squares(off, np.array(covs))
+
+
+def test_a_vehicle_stays_within_its_covariance():
+    """A velocity of 1 cm/s at 5 Hz wanders by 1 cm/s x sqrt(0.2 s x 60 s) on each axis; depth holds the height."""
+    world = small_world()
+    assert position_nees(world, ran(world)[1]).max() < chi2.ppf(0.9999, 3)
+    last = ran(still_world())[1][-1]
+    R = last.world_T_body.rotation().matrix()
+    sigmas = np.sqrt(np.diag(R @ last.covariance[3:, 3:] @ R.T))
+    assert sigmas[:2] == pytest.approx([0.01 * np.sqrt(0.2 * 60)] * 2, rel=0.03)
+    assert sigmas[2] < 0.01
 
 
 @pytest.mark.slow
@@ -205,6 +234,13 @@ def test_the_newest_landmarks_are_those_of_the_window(
         np.testing.assert_allclose(
             cov, estimator.marginal(landmark=landmark_id, over="window"), rtol=1e-9
         )
+    off = newest.positions - solved.positions
+    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(newest.covariances), off)
+    assert nees.max() < 1.0
+    ratio = np.trace(newest.covariances, axis1=1, axis2=2) / np.trace(
+        solved.covariances, axis1=1, axis2=2
+    )
+    assert ((ratio > 0.8) & (ratio < 1.25)).all()
     assert (
         estimator.newest_landmarks().positions.tobytes() == newest.positions.tobytes()
     )
@@ -214,6 +250,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "gate without its policy": (
         {"identity.gate_probability": 0.9},
         'identity.gate_probability: there is no such field with policy = "robust"; identity.policy = "gate" has it',
+    ),
+    "mixture without its policy": (
+        {"identity.view_range_m": 5.0},
+        'policy = "max-mixture" has it',
     ),
     "association without its policy": (
         {"identity.unknown.sightings": 3},
@@ -230,6 +270,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a policy for its section": (
         {"identity": "gate"},
         'identity: expected a section with policy = "gate"',
+    ),
+    "no such section": (
+        {"smother.lag_s": 3},
+        "smother: there is no such field; did you mean smoother?",
     ),
     "its section is missing": (
         {"unknown.density_m2": 1, "lag_s": 20},

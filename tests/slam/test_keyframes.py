@@ -93,14 +93,28 @@ def factor_of(keyframes: Keyframes, kind: type) -> gtsam.NonlinearFactor:
     return factor
 
 
-@pytest.mark.parametrize("is_planar", [False, True])
-def test_every_keyframe_is_level_by_gravity_but_the_first_or_by_the_plane(is_planar):
-    plane = PlanarMotion() if is_planar else None
-    known = Calibration(imu=NO_BIAS, use_gravity=not is_planar, planar=plane)
-    keyframes = driven(known, 6.0)
-    for kind in (gtsam.MagPoseFactorPose3, gtsam.GPSFactorArm)[: 1 + is_planar]:
-        counts = [len(factors_on(keyframes, kind, X(k))) for k in range(4)]
-        assert counts == [int(is_planar), 1, 1, 1]
+def test_every_keyframe_has_its_odometry_gravity_and_plane():
+    keyframes = driven(Calibration(imu=NO_BIAS), 6.0)
+    graph = keyframes.smoother.graph
+    assert graph.size() == 2 + 3 * 2
+    assert [
+        len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) for k in range(4)
+    ] == [0, 1, 1, 1]
+    assert [list(graph.at(k).keys()) for k in (2, 4, 6)] == [
+        [X(0), X(1)],
+        [X(1), X(2)],
+        [X(2), X(3)],
+    ]
+    without = Calibration(imu=NO_BIAS, use_gravity=False)
+    assert driven(without, 6.0).smoother.graph.size() == 2 + 3
+    keyframes = driven(without.model_copy(update={"planar": PlanarMotion()}), 6.0)
+    for kind in (gtsam.MagPoseFactorPose3, gtsam.GPSFactorArm):
+        assert [len(factors_on(keyframes, kind, X(k))) for k in range(4)] == [
+            1,
+            1,
+            1,
+            1,
+        ]
 
 
 def test_gravity_has_the_velocity_noise_of_both_ends():

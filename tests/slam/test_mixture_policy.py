@@ -1,9 +1,13 @@
 """Max-mixture in the window: a fixed point that another solver finds, and choices that follow the estimate."""
 
+from dataclasses import replace
+
+import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 
+from sonar_graph.calibration import FloorPrior
 from sonar_graph.models import Kernel
 from sonar_graph.slam import (
     GaussianKernel,
@@ -12,8 +16,14 @@ from sonar_graph.slam import (
     RobustKernel,
 )
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
+from sonar_graph.slam.landmarks.mixture import (
+    TrackedObject,
+)
+from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import Outcome
 
+from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 
 PLACES = {
@@ -110,6 +120,18 @@ def test_a_landmark_that_begins_in_a_wrong_place_is_moved(
     assert world.outcomes.count(Outcome.UNFIT) == (1 if can_move else 6)
 
 
+def sighting(
+    k: int, z: list[float], pose: int = 0, floor: FloorPrior | None = None
+) -> Sighting:
+    return Sighting(
+        k,
+        k,
+        Sightline(X(pose), gtsam.Pose3(), np.array(z)),
+        np.diag([4e-4, 1e-4]),
+        floor,
+    )
+
+
 def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:
     """A landmark 4 that nothing else was seen of becomes 9 when its track is named so."""
     world = dive("max-mixture")
@@ -122,3 +144,14 @@ def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:
     assert len(world.sightings.landmarks.sightings(9)) == 5
     values = world.sightings.smoothed().values
     assert np.linalg.norm(values.atPoint3(L(9)) - PLACES[9]) < 0.1
+
+
+# A small world, in which all choices can be tried --------------------------------------------------------------------
+
+
+def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
+    """One sighting from pose k of landmark 7 or 4, surely named."""
+    found = small.watch(values, small.PLACES[place], [k], np.zeros((1, 2)), {said: 0.9})
+    floor = FloorPrior(z_m=float(small.PLACES[place][2]), sigma_m=0.05)
+    found.sightings[0] = replace(found.sightings[0], floor=floor)
+    return found

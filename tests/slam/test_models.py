@@ -25,6 +25,7 @@ from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
 
+from .graphs import block_of
 from .made import POSES, polar, random_covariance, some_motion
 
 angles = st.floats(-3.0, 3.0)
@@ -82,6 +83,7 @@ BODY_T_SONAR = gtsam.Pose3(
     gtsam.Rot3.RzRyRx(0.1, 0.4, -0.3), np.array([0.4, 0.1, -0.2])
 )
 keyframes = pytest.mark.parametrize("keyframe", POSES.values(), ids=POSES)
+with_bias = pytest.mark.parametrize("bias", [True, False], ids=["bias", "no bias"])
 
 
 def joint_of(cov: Floats, sizes: dict[int, int]) -> JointCovariance:
@@ -100,8 +102,25 @@ def ahead(
     return keyframe.compose(motion.i_T_j).compose(BODY_T_SONAR).transformFrom(q)
 
 
-def made(keyframe, motion, joint) -> PredictedView:
-    return PredictedView(Tie(X(2), B(0), motion), keyframe, BODY_T_SONAR, joint)
+def made(keyframe, motion, joint, bias: bool = True) -> PredictedView:
+    return PredictedView(
+        Tie(X(2), B(0) if bias else None, motion), keyframe, BODY_T_SONAR, joint
+    )
+
+
+def expected_of(
+    view: PredictedView, landmarks: dict[int, Floats], *ids: int
+) -> tuple[Floats, Floats]:
+    return view.expect([L(i) for i in ids], np.array([landmarks[i] for i in ids]))
+
+
+def some_view(keyframe: gtsam.Pose3, bias: bool, seed: int = 0, sigma: float = 0.02):
+    """View of landmarks 5 and 6, and its parts."""
+    motion = some_motion(seed, sigma / 2)
+    landmarks = {5: ahead(keyframe, motion), 6: ahead(keyframe, motion, -0.6)}
+    sizes = {X(2): 6, L(5): 3, L(6): 3} | ({B(0): 11} if bias else {})
+    joint = joint_of(random_covariance(sum(sizes.values()), sigma, seed + 2), sizes)
+    return made(keyframe, motion, joint, bias), motion, landmarks, joint
 
 
 def moved(
@@ -131,17 +150,40 @@ def numerical_of_view(
 
 
 @keyframes
+@with_bias
+@pytest.mark.parametrize("seed", range(3))
+def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed):
+    """H P H' of pose, landmark and bias together, and the motion's noise, with derivatives by differences.
+
+    Expected jointly each landmark is as alone.
+    """
+    view, motion, landmarks, joint = some_view(keyframe, bias, seed)
+    together, cov = view.expect_jointly(
+        [L(5), L(6)], np.array([landmarks[5], landmarks[6]]), []
+    )
+    for k, (landmark_id, point) in enumerate(landmarks.items()):
+        keys = [X(2), L(landmark_id), *([B(0)] if bias else [])]
+        P = block_of(joint, keys)
+        H = numerical_of_view(keyframe, motion, point)
+        state = H[:, : len(P)]
+        expected = state @ P @ state.T + H[:, 20:] @ motion.covariance @ H[:, 20:].T
+        (z,), (S,) = expected_of(view, landmarks, landmark_id)
+        assert z == pytest.approx(observed(keyframe.compose(motion.i_T_j), point))
+        assert np.allclose(S, expected, rtol=1e-6, atol=1e-12)
+        assert together[k] == pytest.approx(z, abs=1e-12)
+        assert cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] == pytest.approx(S, rel=1e-9)
+
+
+@keyframes
 def test_blurred_noise_is_the_noise_and_the_variances_of_the_motion(keyframe):
-    motion = some_motion()
-    landmark = ahead(keyframe, motion)
-    view = made(keyframe, motion, joint_of(np.eye(6), {X(2): 6}))
+    view, motion, landmarks, _ = some_view(keyframe, True)
     R = np.array([[4e-4, 3e-5], [3e-5, 8e-5]])
-    H = numerical_of_view(keyframe, motion, landmark)[:, 20:]
+    H = numerical_of_view(keyframe, motion, landmarks[5])[:, 20:]
     short = some_motion(9)
     expected = R + np.diag(np.diag(H @ short.covariance @ H.T))
     kept = R.copy()
     assert np.allclose(
-        view.blurred(R[None], short, landmark[None])[0],
+        view.blurred(R[None], short, landmarks[5][None])[0],
         expected,
         rtol=1e-6,
         atol=1e-12,
@@ -174,9 +216,7 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
     noise = cov(0.02, 0.01, by_noise)
     z = np.array([[3.0 + range_off, measured]])
     predicted = np.array([[3.0, expected]])
-    (innovation,), (S,), (distance,), (gain,) = weigh(
-        z, predicted, prior[None], noise[None]
-    )
+    (innovation,), (S,), (distance,), (gain,) = weigh(z, predicted, prior, noise[None])
     assert innovation[0] == pytest.approx(range_off)
     assert abs(innovation[1]) <= np.pi + 1e-12
     assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)

@@ -20,6 +20,7 @@ from .fed import (
     FOREVER_S,
     NEVER_M,
     SONAR,
+    Fed,
     assert_is_least_squares,
     in_the_basin,
     on_the_rail,
@@ -37,10 +38,12 @@ from .made import (
     smoother_with,
     values_of,
 )
-from .rail import Rail, rail
+from .rail import STEP_S, Rail, rail
 
 NODES = 21
 
+
+END_S = (NODES - 1) * STEP_S
 
 _, NUMBERS = rail(NODES)
 
@@ -70,6 +73,15 @@ def test_a_joint_covariance_of_any_poses_is_that_of_all_factors(lag_s):
     keys = [X(2), X(9), L(5)]
     found = block_of(fed.smoother.joint_covariance_of_any(keys), keys)
     assert off_sigmas(found, fed.dense(values, *keys)) < 1e-2
+
+
+def assert_all_is_least_squares(
+    fed: Fed, numbers: Rail, landmarks: tuple[int, ...] = (4, 7)
+) -> None:
+    """The window, and the beginning of the history."""
+    assert_is_least_squares(fed, numbers, NODES, landmarks)
+    x1 = fed.smoother.solve_history()[0].atPose3(X(1)).translation()[0]
+    assert x1 == pytest.approx(numbers.solution(NODES)[0]["x1"], abs=1e-8)
 
 
 def with_ranges(gone: list[tuple[int, int]], *new: tuple[int, int, float]) -> Rail:
@@ -108,20 +120,39 @@ def test_after_an_exchange_the_estimate_is_that_of_what_is_left(monkeypatch, giv
         new = factors.landmark_sighting(X(k), L(3), SONAR, z, R, plain)
         wrong.append(fed.smoother.add(new))
     for _ in range(5):
-        fed.smoother.update()
+        fed.smoother.update(14.0)
     right = solve(graph_of(fed.given), fed.smoother.values).atPoint3(L(3))
     off_m = [np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - right)]
     solved = counted(monkeypatch, batch_solution, "descended")
     if gives_up:
         fed.smoother._window.isam = Refusing(fed.smoother._window.isam)
-    fed.smoother.exchange(wrong)
+    fed.smoother.exchange(14.0, wrong)
     off_m.append(np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - right))
     assert solved or not gives_up
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
 
 
-def test_a_hold_that_is_over_ends_after_an_exchange():
+def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
+    fed = on_the_rail(NODES, 2.6)
+    gone = [(k, 7) for k in range(1, NODES)]
+    removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
+    fed.smoother.exchange(END_S, removed, lost_landmarks=[L(7)])
+    assert_all_is_least_squares(fed, with_ranges(gone), (4,))
+    assert not fed.smoother.values.exists(L(7))
+    (distance,) = (r for k, i, r in NUMBERS.ranges if (k, i) == (NODES - 1, 7))
+    point = (
+        fed.smoother.values.atPose3(X(NODES - 1)).translation()
+        + distance * np.eye(3)[0]
+    )
+    fed.smoother.exchange(
+        END_S, (), [FactorGroup(ranged(NODES - 1, 7, distance, 3e-4))], {L(7): point}
+    )
+    assert_all_is_least_squares(fed, with_ranges(gone[:-1]))
+
+
+@pytest.mark.parametrize("later_s", [0.0, 0.1])
+def test_a_hold_that_is_over_ends_after_an_exchange(later_s):
     """A bounded window keeps its variables while factors are exchanged, and marginalises them at the next update.
 
     The end is least squares, with a range on the keyframe that was held exchanged for another.
@@ -133,10 +164,10 @@ def test_a_hold_that_is_over_ends_after_an_exchange():
     removed = fed.handles_on(X(3), L(4))
     fed.add(ranged(*waiting))
     fed.smoother.hold({})
-    fed.smoother.exchange(removed, [FactorGroup(ranged(*late))])
+    fed.smoother.exchange(END_S + later_s, removed, [FactorGroup(ranged(*late))])
     assert fed.smoother.in_window([X(3)]) == [X(3)]
     assert_is_least_squares(fed, numbers, NODES)
-    fed.smoother.update()
+    fed.smoother.update(END_S + later_s)
     assert not fed.smoother.in_window([X(3)])
     assert_is_least_squares(fed, numbers, NODES)
 
@@ -156,7 +187,7 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
     for k, factor in enumerate(given):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
         smoother.add({"chain": factor})
-        smoother.update()
+        smoother.update(float(k))
     with pytest.raises(RuntimeError, match="Indeterminate"):
         gtsam.ISAM2().update(graph_of(given), smoother.values)
     variance = sigmas[0] ** 2 + 2 * sigmas[1] ** 2
@@ -178,7 +209,7 @@ def test_a_bounded_window_restarts_when_a_landmark_has_moved(
     smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-6)})
     smoother.add_landmark(L(1), np.zeros(3))
     smoother.add({"prior": point_prior(L(1), [shift_m, 0.0, 0.0], 0.01)})
-    smoother.update()
+    smoother.update(0.0)
     assert bool(solved) == is_due
 
 
@@ -236,6 +267,6 @@ def test_an_update_that_makes_the_error_larger_is_undone(monkeypatch, is_wild):
     smoother.add_pose(X(0), start, 0.0)
     smoother.add({"prior": pose_prior(X(0), start, 1e3)})
     smoother.add({"bend": gtsam.CustomFactor(isotropic(1, 1e-2), [X(0)], error)})
-    smoother.update()
+    smoother.update(0.0)
     assert bool(solved) == is_wild
     assert abs(smoother.values.atPose3(X(0)).x()) < 0.5

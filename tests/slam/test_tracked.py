@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -29,11 +30,78 @@ from .late_identities import (
     Watch,
     assert_outcomes_account,
     from_the_start,
+    on_the_rail,
     run,
     see,
 )
 from .made import isam2_params
 from .rail import STEP_S, rail
+
+NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
+
+
+HISTORIES = {
+    "late": [FLAT] * 6 + [SURE[7]],
+    "another that is new": [SURE[5]] * 6 + [SURE[7]],
+    "another that is seen beside it, less surely": [SURE[4]] * 6 + [SURE[7]],
+    "undecided, wrong, wrong, none, right": [FLAT] * 2
+    + [SURE[5]] * 3
+    + [SURE[6]] * 3
+    + [[0.0] * 4] * 2
+    + [SURE[7]],
+    "wrong to the frame before the last": [SURE[6]] * 14 + [SURE[7]],
+}
+
+
+@pytest.mark.parametrize(
+    "lag_s", [1e9, 2.6, 0.6], ids=["all", "five poses", "one pose"]
+)
+@pytest.mark.parametrize("history", HISTORIES)
+def test_on_the_rail_the_end_is_least_squares_with_the_right_identities(
+    history: str, lag_s: float
+):
+    """Poses, landmarks and their variances as numpy has them but for the little that a first direction weighs.
+
+    As known from the start to 1e-8, and the window's landmarks to 1e-6.
+    """
+    _, numbers = rail()
+    nodes = len(numbers.displacements_m) + 1
+    mean, variance = numbers.solution(nodes)
+    sequence = on_the_rail(HISTORIES[history], NEARLY_4)
+    settings = {
+        "kernel__shape": "none",
+        "keyframes__motion_noise_share": 0.0,
+        "smoother__lag_s": lag_s,
+    }
+    estimator, known = (
+        run(given, 1 / STEP_S, **settings)
+        for given in (sequence, from_the_start(sequence))
+    )
+    smoothed = estimator.trajectory()
+    landmarks = estimator.landmarks()
+    assert smoothed.positions[:, 0] == pytest.approx(
+        [mean[f"x{k}"] for k in range(1, nodes)], abs=2e-4
+    )
+    assert smoothed.positions[:, 0] == pytest.approx(
+        known.trajectory().positions[:, 0], abs=1e-8
+    )
+    assert smoothed.covariances[:, 3, 3] == pytest.approx(
+        known.trajectory().covariances[:, 3, 3], rel=1e-6
+    )
+    assert landmarks.ids.tolist() == [4, 7]
+    assert landmarks.positions[:, 0] == pytest.approx(
+        [mean["l4"], mean["l7"]], abs=2e-4
+    )
+    assert landmarks.covariances[:, 0, 0] == pytest.approx(
+        [variance["l4"], variance["l7"]], rel=1e-3
+    )
+    # across, ranges have next to no information
+    live = [given.values.atPoint3(L(7))[0] for given in (estimator, known)]
+    assert live[0] == pytest.approx(live[1], abs=1e-6)
+    outcomes = assert_outcomes_account(estimator, sequence)
+    assert sum(outcomes[used] for used in (Outcome.USED, Outcome.NEW, *LATE)) == len(
+        numbers.ranges
+    )
 
 
 @pytest.mark.parametrize("lag_s", [15.0, 2.0])

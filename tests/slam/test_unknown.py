@@ -220,12 +220,12 @@ def anonymous(
     maker = SightingFactors(
         SonarCalibration(elevation_aperture_rad=aperture_rad), plain
     )
-    landmarks = LandmarkGraph(smoother, maker, AmendableJournal(), None)
+    landmarks = LandmarkGraph(smoother, maker, AmendableJournal())
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     smoother.add({"prior": pose_prior(X(0), gtsam.Pose3(), 1e-4)})
-    smoother.update()
-    landmarks.apply([Assignment(ahead(landmarks, range_m), Outcome.USED, 7)])
-    smoother.flush()
+    smoother.update(0.0)
+    landmarks.apply([Assignment(ahead(landmarks, range_m), Outcome.USED, 7)], 0.0)
+    smoother.flush(0.0)
     policy = AssociatedUnknown(
         gate_probability=0.99,
         density_m2=density_m2,
@@ -249,9 +249,9 @@ def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(
     density = multivariate_normal.pdf(z, expected[0], cov[0] + NOISE)
     policied, _ = anonymous(range_m, share * density / (ODDS * z[0]))
     (paired,) = policied.pair(view, z[None], NOISE[None], set())
-    assert (paired and paired.landmark_id) == (7 if share < 1.0 else None)
+    assert paired.landmark_id == (7 if share < 1.0 else None)
     (named,) = policied.pair(view, z[None], NOISE[None], {7})
-    assert named is None, "the landmark is named elsewhere in the frame"
+    assert named.landmark_id is None, "the landmark is named elsewhere in the frame"
 
 
 PROBABILITY = 0.99
@@ -264,7 +264,7 @@ def one_of_two(
     """Of two landmarks, one of them named, apart along x and known to this beside a common error of 3 m."""
     smoother = smoother_with()
     maker = SightingFactors(SonarCalibration(), plain)
-    landmarks = LandmarkGraph(smoother, maker, AmendableJournal(), None)
+    landmarks = LandmarkGraph(smoother, maker, AmendableJournal())
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     line = Sightline(X(0), gtsam.Pose3(), np.array([2.0, 0.0]))
     noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
@@ -272,7 +272,7 @@ def one_of_two(
     for landmark_id, stamp_ns in zip(ids, frames, strict=True):
         row = landmarks.journal.record(stamp_ns, -1, Outcome.WAITING)
         seen = Sighting(stamp_ns, row, line, noise, None)
-        landmarks.apply([Assignment(seen, Outcome.USED, landmark_id)])
+        landmarks.apply([Assignment(seen, Outcome.USED, landmark_id)], 0.0)
     values = gtsam.Values()
     for landmark_id, x in zip(ids, (0.0, apart_m), strict=True):
         values.insert(L(landmark_id), np.array([x, 2.0, 0.0]))

@@ -9,7 +9,7 @@ mixture_policy.py       policy "max-mixture", with the log densities and votes o
 
 # fmt: off
 from sonar_graph.slam.landmarks.landmark_graph import (
-    AmendableJournal, Assignment, IdentityPolicy, LandmarkGraph, Solution,
+    AmendableJournal, Decision, IdentityPolicy, LandmarkGraph, Solution,
 )
 from sonar_graph.slam.landmarks.mixture_policy import IdentityParams, MixtureIdentities, MixtureIdentity
 from sonar_graph.slam.landmarks.sighting import Frame, SeenFrame, SightingFactors
@@ -17,7 +17,7 @@ from sonar_graph.slam.landmarks.tracked import GatedIdentity, RobustIdentity, Tr
 from sonar_graph.slam.landmarks.unknown import AssociatedUnknown, NamelessLandmarks, unnamed
 
 __all__ = [
-    "AmendableJournal", "Assignment", "AssociatedUnknown", "Frame", "GatedIdentity", "IdentityParams", "IdentityPolicy",
+    "AmendableJournal", "AssociatedUnknown", "Decision", "Frame", "GatedIdentity", "IdentityParams", "IdentityPolicy",
     "LandmarkGraph", "MixtureIdentities", "MixtureIdentity", "NamelessLandmarks", "RobustIdentity", "SeenFrame",
     "SightingFactors", "Solution", "TrackedIdentities", "unnamed",
 ]

@@ -1,6 +1,6 @@
 """Landmarks of the graph, the states of detections, and the decisions that change them.
 
-A policy decides what becomes of sightings (`Assignment`). `LandmarkGraph.apply` alone changes their states, their factors
+A policy decides what becomes of sightings (`Decision`). `LandmarkGraph.apply` alone changes their states, their factors
 and the journal::
 
     not judged ──► used, new, reassigned                in the graph at the next update
@@ -19,7 +19,9 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Sequence, Set
+from copy import deepcopy
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -40,7 +42,6 @@ from sonar_graph.slam.landmarks.sighting import (
 from sonar_graph.slam.smoother import (
     Changed,
     FactorGroup,
-    Factors,
     Known,
     Marginals,
     Sightline,
@@ -50,6 +51,7 @@ from sonar_graph.states import (
     OUTCOME_NUMBERS,
     UNKNOWN,
     DetectionJournal,
+    DetectionLog,
     Outcome,
 )
 
@@ -64,15 +66,31 @@ IN_GRAPH = frozenset(
     }
 )
 """States of a sighting whose factors are in the graph."""
-MAY_CHANGE = IN_GRAPH | {
-    Outcome.WAITING,
-    Outcome.TAKEN_BACK,
-    Outcome.GATED,
-    Outcome.REPEATED,
-    Outcome.WITHHELD,
-    Outcome.UNFIT,
+FITTING = frozenset({Outcome.USED_LATER, Outcome.REASSIGNED, Outcome.UNFIT})
+GIVEN_UP = frozenset({Outcome.FORGOTTEN, Outcome.NO_IDENTITY})
+LATER: dict[Outcome | None, frozenset[Outcome]] = {
+    None: frozenset(
+        {Outcome.USED, Outcome.NEW, Outcome.REASSIGNED, Outcome.GATED, Outcome.REPEATED}
+    )
+    | {Outcome.UNFIT, Outcome.WAITING},
+    Outcome.WAITING: GIVEN_UP
+    | {
+        Outcome.USED_LATER,
+        Outcome.PLACED_LATER,
+        Outcome.NEW,
+        Outcome.GATED,
+        Outcome.REPEATED,
+    },
+    **dict.fromkeys(
+        IN_GRAPH, FITTING | {Outcome.TAKEN_BACK, Outcome.MOVED, Outcome.WITHHELD}
+    ),
+    Outcome.TAKEN_BACK: frozenset({Outcome.MOVED, Outcome.GATED, Outcome.REPEATED}),
+    Outcome.GATED: frozenset({Outcome.WAITING}),
+    Outcome.REPEATED: frozenset({Outcome.WAITING}),
+    Outcome.WITHHELD: FITTING | {Outcome.WAITING, Outcome.TAKEN_BACK},
+    Outcome.UNFIT: FITTING,
 }
-"""States that another may follow; all others are final."""
+"""States that may follow a state; None: not judged yet. A state that is not a key is final."""
 
 
 class Assignment(NamedTuple):
@@ -92,8 +110,36 @@ class Assignment(NamedTuple):
     """First estimate of a landmark that begins with it, shape (3,); None: where the sighting places it."""
 
 
-Decisions = Iterable[list[Assignment]]
-"""Assignments of which each list is applied, and the estimate updated if that is due, before the next is asked for."""
+@dataclass(frozen=True)
+class Decision:
+    """What becomes of sightings: rounds of assignments, each applied before the next, with an update between them."""
+
+    rounds: tuple[tuple[Assignment, ...], ...] = ()
+    released: tuple[int, ...] = ()
+    """Landmarks of the map that have moved: they leave the graph afterwards."""
+    settles: bool = False
+    """True: before all rounds, add what waits to the estimate and iterate it to convergence."""
+
+    @classmethod
+    def of(
+        cls, assignments: Iterable[Assignment], released: Iterable[int] = ()
+    ) -> Decision:
+        """Decision of one round, or of none without assignments."""
+        one_round = tuple(assignments)
+        return cls((one_round,), tuple(released)) if one_round else UNCHANGED
+
+    @property
+    def assignments(self) -> list[Assignment]:
+        """All rounds together."""
+        return [each for one_round in self.rounds for each in one_round]
+
+    @property
+    def is_empty(self) -> bool:
+        """True when nothing changes."""
+        return not self.rounds and not self.settles
+
+
+UNCHANGED = Decision()
 
 
 class Solution(NamedTuple):
@@ -108,8 +154,10 @@ class Solution(NamedTuple):
 class IdentityPolicy:
     """Decides which landmark each sighting shows.
 
-    For each frame `Frontend` calls `revise`, `rivals` and `judge` in this order; without detections for the policy (None)
-    only `revise`. A method that a policy does not define decides nothing.
+    For each frame `Frontend` calls `retract`, `associate`, `rivals` and `judge` in this order, then `reconsider` until
+    its decision is empty. It applies each decision, and updates the estimate if that is due, before the next call.
+    Without detections for the policy (None) only `retract` and `associate` are called. A method that a policy does not
+    define decides nothing.
     """
 
     def __init__(self, landmarks: LandmarkGraph) -> None:
@@ -120,21 +168,29 @@ class IdentityPolicy:
         """Refuse rows by their identities and tracks alone; None: the row stays."""
         raise NotImplementedError
 
-    def revise(self, frame: Frame | None) -> Decisions:  # noqa: ARG002
-        """Retract earlier sightings whose identity this frame changes, then associate those whose identity it reveals."""
-        return ()
+    def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Retract earlier sightings whose identity this frame changes."""
+        return UNCHANGED
+
+    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Associate earlier sightings whose identity this frame reveals."""
+        return UNCHANGED
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:
         """Keys of the variables with which the frame's detections are compared."""
         raise NotImplementedError
 
-    def judge(self, seen: SeenFrame) -> Decisions:
-        """Decide on the frame's detections; then on earlier sightings again, at the estimate that the frame changed."""
+    def judge(self, seen: SeenFrame) -> Decision:
+        """Decide on the frame's detections."""
         raise NotImplementedError
 
     def held(self) -> dict[int, float]:
         """Keyframes to keep in the window because sightings wait on them, with the time until which (s)."""
         return {}
+
+    def reconsider(self) -> Decision:
+        """Decide on earlier sightings again, after the frame has changed the estimate."""
+        return UNCHANGED
 
     def forget(self, now_ns: int, left: Set[int] = frozenset()) -> list[Assignment]:  # noqa: ARG002
         """Give up sightings that have waited too long, or whose keyframes leave a bounded window."""
@@ -213,7 +269,7 @@ class LandmarkGraph:
         smoother: Smoother,
         factors: SightingFactors,
         journal: AmendableJournal,
-        known_map: KnownMap | None,
+        known_map: KnownMap | None = None,
     ) -> None:
         self.smoother = smoother
         self.factors = factors
@@ -265,64 +321,62 @@ class LandmarkGraph:
         """Stamps of the frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
 
-    def begin(self) -> None:
+    def begin(self, time_s: float) -> None:
         """Add the landmarks of the map with their joint prior, once the graph has its first keyframe."""
         if not self.known.held or self._map_prior is not None:
             return
-        places = zip(self.known.ids, self.known.places(), strict=True)
-        for landmark_id, place in places:
-            self.smoother.add_landmark(L(landmark_id), place)
-        self._map_prior = self.smoother.add(self._prior())
-        self.follow(self.smoother.flush())
+        keys = [L(i) for i in self.known.ids]
+        for key, place in zip(keys, self.known.places(), strict=True):
+            self.smoother.add_landmark(key, place)
+        prior = map_prior(keys, self.known.places(), self.known.joint())
+        self._map_prior = self.smoother.add({"map prior": prior})
+        self.follow(self.smoother.flush(time_s))
 
-    def release(self) -> None:
+    def release(self, landmark_ids: Sequence[int], time_s: float) -> None:
         """Take landmarks that have moved out of the graph, with their sightings; the others keep their prior."""
-        released = [
-            i
-            for i in self.known.moved
-            if i not in self.known.held and self._rooted.get(i) is ON_MAP
-        ]
-        if not released or self._map_prior is None:
-            return
-        fitted = [each for i in released for each in self.sightings(i)]
-        self.apply([Assignment(each, Outcome.UNFIT) for each in fitted])
-        for landmark_id in released:
+        fitted = [each for i in landmark_ids for each in self.sightings(i)]
+        self.apply([Assignment(each, Outcome.UNFIT) for each in fitted], time_s)
+        for landmark_id in landmark_ids:
             del self._of[landmark_id]
             del self._rooted[landmark_id]
+        rows = [k for k, i in enumerate(self.known.ids) if i in self.known.held]
+        groups = []
+        if rows:
+            coordinates = np.add.outer(3 * np.array(rows), np.arange(3)).ravel()
+            prior = map_prior(
+                [L(self.known.ids[k]) for k in rows],
+                self.known.places()[rows],
+                self.known.joint()[np.ix_(coordinates, coordinates)],
+            )
+            groups.append(FactorGroup({"map prior": prior}))
+        assert self._map_prior is not None
         changed = self.smoother.exchange(
-            [self._map_prior],
-            [FactorGroup(self._prior())],
-            lost_landmarks=[*map(L, released)],
+            time_s, [self._map_prior], groups, lost_landmarks=[*map(L, landmark_ids)]
         )
-        (self._map_prior,) = changed.added
+        if changed.added:
+            self._map_prior = changed.added[0]
         self.follow(changed)
 
-    def _prior(self) -> Factors:
-        """Joint prior of the landmarks that the map still holds."""
-        rows = [k for k, i in enumerate(self.known.ids) if i in self.known.held]
-        coordinates = np.add.outer(3 * np.array(rows), np.arange(3)).ravel()
-        prior = map_prior(
-            [L(self.known.ids[k]) for k in rows],
-            self.known.places()[rows],
-            self.known.joint()[np.ix_(coordinates, coordinates)],
-        )
-        return {"map prior": prior}
-
-    def settle(self) -> None:
+    def settle(self, time_s: float) -> None:
         """Add the factors that wait to the estimate, and iterate it to convergence."""
-        self.follow(self.smoother.flush())
-        self.smoother.settle()
+        self.follow(self.smoother.flush(time_s))
+        self.smoother.settle(time_s)
 
-    def apply(self, assignments: Iterable[Assignment]) -> None:
+    def apply(self, assignments: Iterable[Assignment], time_s: float) -> None:
         """Change the states of sightings, and with them journal and graph.
 
         Factors of sightings that are judged for the first time enter at the next update. All others are exchanged now.
         """
         added: list[Assignment] = []
         retracted: list[Sighting] = []
-        associated: dict[Sighting, int] = {}
+        associated: list[tuple[Sighting, int]] = []
         for each in assignments:
             state = self.state(each.sighting)
+            # a policy that breaks the table would leave factors in the graph that no state names
+            if each.outcome not in LATER.get(state.outcome, ()):
+                raise AssertionError(
+                    f"a sighting that is {state.outcome!r} cannot become {each.outcome!r}"
+                )
             self.journal.amend(each)
             if state.landmark_id is not None:
                 retracted.append(each.sighting)
@@ -330,16 +384,27 @@ class LandmarkGraph:
                 if state.outcome is None:
                     added.append(each)
                 else:
-                    associated[each.sighting] = each.landmark_id
-            if each.outcome in MAY_CHANGE:
-                self._states[each.sighting] = state._replace(outcome=each.outcome)
+                    associated.append((each.sighting, each.landmark_id))
+            if each.outcome in LATER:
+                self._states[each.sighting] = State(
+                    each.outcome, state.landmark_id, state.handle
+                )
             else:
                 self._states.pop(each.sighting, None)
         # before an exchange, which enters what waits
         for each in added:
             self._add(each)
         if retracted or associated:
-            self._exchange(retracted, associated)
+            self._exchange(retracted, associated, time_s)
+
+    def log(self, rechosen: list[Assignment]) -> DetectionLog:
+        """Outcomes of all detections, with other assignments for some; nothing else changes."""
+        if not rechosen:
+            return self.journal.log()
+        journal = deepcopy(self.journal)  # the run goes on with its own
+        for each in rechosen:
+            journal.amend(each)
+        return journal.log()
 
     def follow(self, changed: Changed) -> None:
         """Update states after the smoother has withheld factors, or poses have left a bounded window.
@@ -373,27 +438,35 @@ class LandmarkGraph:
         key = L(new.landmark_id)
         is_first = new.landmark_id not in self
         if is_first:
-            start = new.start
-            if start is None:
-                start = self.factors.start(new.sighting, self.smoother.estimates)
+            start = (
+                self.factors.start(new.sighting, self.smoother.estimates)
+                if new.start is None
+                else new.start
+            )
             self.smoother.add_landmark(key, start)
         make = partial(self.factors.make, new.sighting, key, is_first=is_first)
         group = FactorGroup(make, (key, new.sighting.line))
         handle = self.smoother.add(group, gain=new.gain)
         self._insert(new.sighting, new.landmark_id, handle)
 
-    def _exchange(self, retracted: list[Sighting], new_of: dict[Sighting, int]) -> None:
+    def _exchange(
+        self,
+        retracted: list[Sighting],
+        associated: list[tuple[Sighting, int]],
+        time_s: float,
+    ) -> None:
         """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
 
         A landmark begins with its first sighting and leaves the graph with its last.
         """
         # only factors that have entered the smoother can be taken out
-        self.follow(self.smoother.flush())
+        self.follow(self.smoother.flush(time_s))
         old_of: dict[Sighting, int] = {}
         for sighting in retracted:
             landmark_id = self.state(sighting).landmark_id
             if landmark_id is not None:  # the flush may have withheld it
                 old_of[sighting] = landmark_id
+        new_of = dict(associated)
         first_before = {
             i: self._first(i) for i in sorted({*old_of.values(), *new_of.values()})
         }
@@ -426,7 +499,9 @@ class LandmarkGraph:
             L(i) for i, s in first.items() if s is None and first_before[i] is not None
         ]
         handles = [handle for handle in removed if handle is not None]
-        changed = self.smoother.exchange(handles, list(made.values()), begun, lost)
+        changed = self.smoother.exchange(
+            time_s, handles, list(made.values()), begun, lost
+        )
         for sighting, handle in zip(made, changed.added, strict=True):
             self._states[sighting] = self._states[sighting]._replace(handle=handle)
         self.follow(changed)

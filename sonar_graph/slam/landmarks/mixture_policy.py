@@ -23,8 +23,9 @@ from sonar_graph.calibration import tagged
 from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
 from sonar_graph.models import Kernel, locate
 from sonar_graph.slam.landmarks.landmark_graph import (
+    UNCHANGED,
     Assignment,
-    Decisions,
+    Decision,
     IdentityPolicy,
     LandmarkGraph,
     Solution,
@@ -45,7 +46,7 @@ from sonar_graph.slam.landmarks.tracked import (
     RobustIdentity,
     second_rows_of_tracks,
 )
-from sonar_graph.slam.smoother import Marginals, solve_in_sight
+from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
 from sonar_graph.states import Outcome
 
 MOST_WINDOW_ROUNDS = 3
@@ -89,10 +90,6 @@ Changes = list[tuple[TrackedObject, int | None]]
 """Tracked objects with the landmark that each is to count as; None: no landmark."""
 
 
-SightingsOf = dict[int, list[Sighting]]
-"""Sightings of each landmark."""
-
-
 class ChosenHistory(NamedTuple):
     """Solution of the whole history with the choices that suit it best."""
 
@@ -119,6 +116,10 @@ class MixtureIdentities(IdentityPolicy):
         """Landmarks that an object names and is not taken for."""
         self._oldest_ns = 0
         """Stamp from which on sightings wait."""
+        self._round = 0
+        """Number of revisions of the window since the last frame, one of them to settle the estimate."""
+        self._open: list[TrackedObject] = []
+        """Objects whose choices `reconsider` revises."""
         self._chosen: tuple[gtsam.Values, int, ChosenHistory] | None = None
         """Solution from which the history was chosen, number of sightings then, and the history."""
 
@@ -140,21 +141,24 @@ class MixtureIdentities(IdentityPolicy):
                 :, :MOST_RIVALS
             ]
             kept: set[int | None] = {ids[k] for k in np.unique(nearest).tolist()}
-            for row in range(len(frame)):
-                kept.update(IdentityPosterior.of(frame.detections, row).probability)
+            kept.update(
+                *(
+                    IdentityPosterior.of(frame.detections, row).probability
+                    for row in range(len(frame))
+                )
+            )
             kept.update(map(self.landmark_of, self._tracks.values()))
             ids = [i for i in ids if i in kept]
         return [L(i) for i in ids]
 
-    def judge(self, seen: SeenFrame) -> Decisions:
+    def judge(self, seen: SeenFrame) -> Decision:
         """Choose a landmark for each detection, and for what waited in its track.
 
-        The detection of a known track is of its landmark. Tracks that are over are forgotten. Then revise the choices of
-        the window until none changes, and move landmarks to where their sightings agree.
+        The detection of a known track is of its landmark. Tracks that are over are forgotten.
         """
         frame = seen.frame
         rows = list(range(len(frame)))
-        tracks = frame.tracks
+        tracks = frame.detections.track.tolist()
         posteriors = [IdentityPosterior.of(frame.detections, row) for row in rows]
         ids = [gtsam.Symbol(key).index() for key in seen.keys]
         points = np.array(
@@ -170,11 +174,14 @@ class MixtureIdentities(IdentityPolicy):
                 scores.append({landmark_id: np.inf})
             else:
                 S = S_0 + frame.noise[row]
-                belief, z = posteriors[row], frame.z[row]
-                scores.append(self.mixture.at_first(belief, ids, z, expected, S))
+                scores.append(
+                    self.mixture.at_first(
+                        posteriors[row], ids, frame.z[row], expected, S
+                    )
+                )
         chosen = each_once(scores, [{frame.stamp_ns}] * len(frame))
         judged: list[Assignment] = []
-        for row, sighting in enumerate(seen.sightings(rows)):
+        for row, sighting in enumerate(seen.sightings(rows, seen.beam_points(rows))):
             each = self._tracked(tracks[row], posteriors[row])
             judged += self._extended(each, sighting, chosen[row])
         # the recogniser may use the number of a track that is over for another object
@@ -184,10 +191,8 @@ class MixtureIdentities(IdentityPolicy):
             for k, each in self._tracks.items()
             if each.sightings[-1].stamp_ns >= self._oldest_ns
         }
-        yield judged
-        yield from self._revised_window()
-        # places last: a landmark moves only when no choice changes any more
-        yield from self._relocated_in_window()
+        self._round = 0
+        return Decision.of(judged)
 
     def held(self) -> dict[int, float]:
         """Keyframes of sightings of tracks that are of no landmark yet."""
@@ -199,6 +204,12 @@ class MixtureIdentities(IdentityPolicy):
             for sighting in each.sightings
             if sighting.stamp_ns >= self._oldest_ns
         }
+
+    def reconsider(self) -> Decision:
+        """Revise the choices of the window until none changes; then move landmarks to where their sightings agree."""
+        # places last: a landmark moves only when no choice changes any more
+        revised = self._revise_window()
+        return self._relocate() if revised.is_empty else revised
 
     def smoothed(self) -> Solution:
         """Solution of the whole graph with the choices that suit it best."""
@@ -284,49 +295,54 @@ class MixtureIdentities(IdentityPolicy):
             if new != self.landmark_of(each)
         ]
 
-    def _revised_window(self) -> Decisions:
-        """Choices in the window, until none changes, or `MOST_WINDOW_ROUNDS` times."""
-        objects = self._revisable()
-        if not self._changes(objects):
-            return
-        # a step of a robust kernel may end far from the minimum at which the choices are to be revised
-        self.landmarks.settle()
-        for _ in range(MOST_WINDOW_ROUNDS):
-            preferred = [
-                (each, new)
-                for each, new in self._changes(objects)
-                if self._is_preferred(new, each)
-            ]
-            if not preferred:
-                return
-            self._dispute(preferred)
-            yield _assigned(preferred)
+    def _revise_window(self) -> Decision:
+        """Next choices in the window; empty when none changes, and after `MOST_WINDOW_ROUNDS`."""
+        self._round += 1
+        if (
+            self._round == 1
+        ):  # the window is read once a frame; later rounds revise the same objects
+            self._open = self._revisable()
+        if self._round > 1 + MOST_WINDOW_ROUNDS:
+            self._open = []
+        changes = self._changes(self._open)
+        if changes and self._round == 1:
+            # a step of a robust kernel may end far from the minimum at which the choices are to be revised
+            return Decision(settles=True)
+        preferred = [
+            (each, new) for each, new in changes if self._is_preferred(new, each)
+        ]
+        if not preferred:
+            self._open = []
+        self._dispute(preferred)
+        return Decision.of(_assigned(preferred))
 
-    def _relocated_in_window(self) -> Decisions:
-        """Begin disputed landmarks again where the objects that name them agree that they are."""
+    def _relocate(self) -> Decision:
+        """Begin the next disputed landmark again where the objects that name it agree that it is."""
         while self._disputed:
             # the order must not depend on how the set was filled
             landmark_id = min(self._disputed)
             self._disputed.discard(landmark_id)
             if landmark_id not in self.landmarks:
                 continue
-            choices = [self.landmark_of(each) for each in self.objects]
+            naming = [
+                each for each in self.objects if each.posterior.favourite == landmark_id
+            ]
+            choices = [self.landmark_of(each) for each in naming]
             supporters = supporters_elsewhere(
-                landmark_id,
-                self.objects,
-                choices,
-                self.smoother.estimates,
-                self.mixture,
+                landmark_id, naming, choices, self.smoother.estimates, self.mixture
             )
             if supporters is not None:
-                # a landmark begins in a new place only after it has lost its last sighting
-                of_it: Changes = [
-                    (each, None)
-                    for each, choice in zip(self.objects, choices, strict=True)
-                    if choice == landmark_id
-                ]
-                yield _assigned(of_it)
-                yield _assigned([(each, landmark_id) for each in supporters])
+                leaving = _assigned(
+                    [
+                        (each, None)
+                        for each in self.objects
+                        if self.landmark_of(each) == landmark_id
+                    ]
+                )
+                coming = _assigned([(each, landmark_id) for each in supporters])
+                # in two rounds: a landmark begins in a new place only after it has lost its last sighting
+                return Decision((tuple(leaving), tuple(coming)))
+        return UNCHANGED
 
     def _revisable(self) -> list[TrackedObject]:
         """Objects whose choices are revised: tracks whose posterior contradicts it, and objects in the window.
@@ -411,23 +427,25 @@ class MixtureIdentities(IdentityPolicy):
             for each in objects
             for sighting in each.sightings
         }
-        rest = self.smoother.graph_without(handles)
+        rest = self.smoother.graph_without(
+            {handle for handle in handles if handle is not None}
+        )
         values = solved
         choices = [self.landmark_of(each) for each in objects]
         for _ in range(MOST_HISTORY_ROUNDS):
             # first the choices at the solution; when they are stable, the places of landmarks
             start = values
-            sizes = {i: len(s) for i, s in _sightings_of(objects, choices).items()}
-            better = self.mixture.best(objects, values, choices, sizes)
+            better = self.mixture.best(
+                objects, values, choices, _sizes(objects, choices)
+            )
             if better == choices:
                 start, better = self._relocated(objects, values, choices)
             if better == choices:
                 break
-            values = self._solution(rest, _sightings_of(objects, better), start)
+            values = self.solution(rest, objects, start, better)
             choices = better
         if values is not solved:  # else those of the run's own graph hold
-            graph = self._graph(rest, _sightings_of(objects, choices))
-            marginals = Marginals(graph, values)
+            marginals = Marginals(self.graph(rest, objects, choices), values)
         return ChosenHistory(values, marginals, objects, choices)
 
     def _is_withheld(self, each: TrackedObject) -> bool:
@@ -442,49 +460,69 @@ class MixtureIdentities(IdentityPolicy):
     ) -> tuple[gtsam.Values, Choices]:
         """Begin landmarks that began with something else where those that name them agree that they are."""
         moved = gtsam.Values(values)
-        for landmark_id in sorted(_sightings_of(objects, choices)):
+        for landmark_id in sorted(_sizes(objects, choices)):
+            named = [each.posterior.favourite == landmark_id for each in objects]
+            naming = [
+                each for each, is_named in zip(objects, named, strict=True) if is_named
+            ]
+            present = [
+                choice
+                for choice, is_named in zip(choices, named, strict=True)
+                if is_named
+            ]
             supporters = supporters_elsewhere(
-                landmark_id, objects, choices, values, self.mixture
+                landmark_id, naming, present, values, self.mixture
             )
             if supporters is None:
                 continue
+            without = [None if choice == landmark_id else choice for choice in choices]
             choices = [
-                landmark_id
-                if each in supporters
-                else (None if choice == landmark_id else choice)
-                for each, choice in zip(objects, choices, strict=True)
+                landmark_id if each in supporters else choice
+                for each, choice in zip(objects, without, strict=True)
             ]
             first = min((s for each in supporters for s in each.sightings), key=_age)
             moved.update(L(landmark_id), self.landmarks.factors.start(first, values))
         return moved, choices
 
-    def _solution(
+    def solution(
         self,
         rest: gtsam.NonlinearFactorGraph,
-        of: SightingsOf,
+        objects: list[TrackedObject],
         values: gtsam.Values,
+        choices: Choices,
     ) -> gtsam.Values:
-        """Solution of the history in which each landmark has these sightings."""
+        """Solution of the history in which each tracked object is the landmark chosen for it."""
         start = gtsam.Values(values)
-        for i, sightings in of.items():
+        lines: dict[int, list[Sightline]] = defaultdict(list)
+        for each, choice in zip(objects, choices, strict=True):
+            if choice is None:
+                continue
+            lines[L(choice)] += [sighting.line for sighting in each.sightings]
             # a landmark that the run does not have begins where its first object has it
-            if not start.exists(L(i)):
-                place = self.landmarks.factors.start(sightings[0], values)
-                start.insert(L(i), place)
-        lines = {L(i): [s.line for s in sightings] for i, sightings in of.items()}
-        return solve_in_sight(self._graph(rest, of), start, lines)
+            if not start.exists(L(choice)):
+                start.insert(
+                    L(choice), self.landmarks.factors.start(each.sightings[0], values)
+                )
+        return solve_in_sight(self.graph(rest, objects, choices), start, lines)
 
-    def _graph(
-        self, rest: gtsam.NonlinearFactorGraph, of: SightingsOf
+    def graph(
+        self,
+        rest: gtsam.NonlinearFactorGraph,
+        objects: list[TrackedObject],
+        choices: Choices,
     ) -> gtsam.NonlinearFactorGraph:
-        """All factors, with those of these sightings of each landmark."""
+        """All factors, those of sightings as chosen."""
         graph = gtsam.NonlinearFactorGraph(rest)
-        for i, sightings in of.items():
+        of: dict[int, list[Sighting]] = defaultdict(list)
+        for each, choice in zip(objects, choices, strict=True):
+            if choice is not None:
+                of[choice] += each.sightings
+        for landmark_id, sightings in of.items():
             # as in `LandmarkGraph`, the earliest has the factors that a landmark has once
-            first = min(sightings, key=_age)
-            for s in sorted(sightings, key=_age):
-                made = self.landmarks.factors.make(s, L(i), is_first=s is first)
-                for factor in made.values():
+            for k, sighting in enumerate(sorted(sightings, key=_age)):
+                for factor in self.landmarks.factors.make(
+                    sighting, L(landmark_id), is_first=k == 0
+                ).values():
                     graph.add(factor)
         return graph
 
@@ -511,10 +549,10 @@ def _age(sighting: Sighting) -> tuple[int, int]:
     return sighting.stamp_ns, sighting.row
 
 
-def _sightings_of(objects: list[TrackedObject], choices: Choices) -> SightingsOf:
-    """Sightings of each chosen landmark."""
-    of: SightingsOf = defaultdict(list)
+def _sizes(objects: list[TrackedObject], choices: Choices) -> dict[int, int]:
+    """Number of sightings of each chosen landmark."""
+    sizes: dict[int, int] = defaultdict(int)
     for each, choice in zip(objects, choices, strict=True):
         if choice is not None:
-            of[choice] += each.sightings
-    return of
+            sizes[choice] += len(each.sightings)
+    return sizes

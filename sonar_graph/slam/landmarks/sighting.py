@@ -70,15 +70,17 @@ class SightingFactors:
             self.elevation_sigma_rad if is_first and sighting.floor is None else None
         )
         # once for each landmark, and only where no floor gives the height
-        made = factors.landmark_sighting(
-            line.pose_key,
-            key,
-            line.body_T_sonar,
-            line.z,
-            sighting.noise,
-            self._robust,
-            elevation,
-        )
+        made: Factors = {
+            **factors.landmark_sighting(
+                line.pose_key,
+                key,
+                line.body_T_sonar,
+                line.z,
+                sighting.noise,
+                self._robust,
+                elevation,
+            )
+        }
         if is_first:
             # in the keyframe's body frame
             body_p_landmark = locate(
@@ -106,11 +108,12 @@ class SightingFactors:
         """Elevation (rad) of a floor at a range and azimuth; 0 without a floor in the aperture."""
         if floor is None:
             return 0.0
-        range_m, azimuth_rad = z.tolist()
-        found = elevation_on_floor(
-            world_T_sonar, range_m, azimuth_rad, floor.z_m, self._aperture_rad
+        return (
+            elevation_on_floor(
+                world_T_sonar, float(z[0]), float(z[1]), floor.z_m, self._aperture_rad
+            )
+            or 0.0
         )
-        return found or 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,23 +173,23 @@ class SeenFrame:
     factors: SightingFactors
 
     def __post_init__(self) -> None:
-        self.beam_points, height_variance = self.view.beams(self.frame.z)
-        """Points of the world at the measured range and azimuth and elevation 0, shape (m, 3), m."""
+        self._points, height_variance = self.view.beams(self.frame.z)
         self.floors = self._floors_under(height_variance)
         """Known floor of each detection; None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
 
+    def beam_points(self, rows: list[int]) -> Floats:
+        """Points of the world at the measured range and azimuth and elevation 0, shape (len(rows), 3), m."""
+        return self._points[rows]
+
     def sightings(
-        self,
-        rows: list[int],
-        points: Floats | None = None,
-        elevation_rad: float = 0.0,
+        self, rows: list[int], points: Floats, elevation_rad: float = 0.0
     ) -> list[Sighting]:
         """Sightings of some detections.
 
         Parameters
         ----------
         points
-            Of the world, shape (len(rows), 3), where the motion's noise is taken; None: the `beam_points`.
+            Of the world, shape (len(rows), 3): the motion's noise is taken there.
         elevation_rad
             See `Sighting`.
         """
@@ -194,8 +197,6 @@ class SeenFrame:
             return []
         frame = self.frame
         keyframe_T_sonar = self.tie.motion.i_T_j.compose(self.factors.body_T_sonar)
-        if points is None:
-            points = self.beam_points[rows]
         # from here on the sonar hangs on the keyframe without error: the motion's error becomes noise
         noise = self.view.blurred(frame.noise[rows], self.tie.motion, points)
         return [
@@ -219,9 +220,7 @@ class SeenFrame:
         by_elevation = np.square(slope_m * self.factors.elevation_sigma_rad)
         variance = by_elevation + height_variance + floor.sigma_m**2
         # an object on a wall or a wreck must not be pulled to the floor
-        is_on_floor = (
-            np.square(self.beam_points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
-        )
+        is_on_floor = np.square(self._points[:, 2] - floor.z_m) <= FLOOR_GATE * variance
         return [floor if is_on else None for is_on in is_on_floor.tolist()]
 
 

@@ -24,8 +24,9 @@ from sonar_graph.measurements import NO_TRACK, NS_PER_S, LandmarkDetections
 from sonar_graph.models import ACCEPTED, MINIMUM_PROBABILITY, Verdict, identify, locate
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.landmarks.landmark_graph import (
+    UNCHANGED,
     Assignment,
-    Decisions,
+    Decision,
     IdentityPolicy,
     LandmarkGraph,
 )
@@ -116,8 +117,12 @@ class Track:
     def reopen(self, sightings: list[Sighting]) -> None:
         """Let settled sightings wait again."""
         reopened = set(sightings)
-        self.settled = [s for s in self.settled if s not in reopened]
-        self.waiting = sorted(self.waiting + sightings, key=lambda s: s.stamp_ns)
+        self.settled = [
+            sighting for sighting in self.settled if sighting not in reopened
+        ]
+        self.waiting = sorted(
+            self.waiting + sightings, key=lambda sighting: sighting.stamp_ns
+        )
 
 
 class TrackedIdentities(IdentityPolicy):
@@ -132,6 +137,8 @@ class TrackedIdentities(IdentityPolicy):
         self._minimum_probability = params.minimum_probability
         self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
+        self._claims: list[Track] = []
+        """Tracks that this frame decides or gives back their landmark, the most probable first."""
 
     def screen(self, frame: LandmarkDetections) -> list[Outcome | None]:
         """Refuse second rows of tracks, improbable identities, and those that the frame has in a more probable row."""
@@ -153,23 +160,23 @@ class TrackedIdentities(IdentityPolicy):
             refusals[row] = None if number == ACCEPTED else OUTCOMES[number]
         return refusals
 
-    def revise(self, frame: Frame | None) -> Decisions:
-        """Give tracks their new identities, then associate what waits in the tracks that this frame decides.
+    def retract(self, frame: Frame | None) -> Decision:
+        """Give tracks their new identities, and let their sightings of another landmark wait again.
 
-        First their sightings of another landmark wait again, and with them the sightings that these had displaced. A
-        sighting is displaced when another track had its landmark in its frame. Then, where two tracks claim one landmark in
-        one earlier frame, a sighting that is used already stays. Else that of the track with the more probable row gets it.
+        Sightings that these had displaced wait again too. A sighting is displaced when another track had its landmark
+        in its frame.
         """
-        tracked = frame and frame.select([track != NO_TRACK for track in frame.tracks])
-        if not tracked:
-            return
-        assigned = self.forget(tracked.stamp_ns)
-        claims: list[Track] = []
-        """Tracks that are decided or get their landmark back, the most probable first."""
+        self._claims = []
+        if frame is None:
+            return UNCHANGED
+        tracked = frame.select([track != NO_TRACK for track in frame.tracks])
+        if tracked is None:
+            return UNCHANGED
+        given_up = self.forget(tracked.stamp_ns)
         reopened: list[Sighting] = []
         freed: set[tuple[int, int]] = set()
         for track, identity in self._decided(tracked):
-            claims.append(track)
+            self._claims.append(track)
             if identity == track.identity:
                 continue
             for sighting in track.settled:
@@ -182,28 +189,28 @@ class TrackedIdentities(IdentityPolicy):
         # sightings that lost their frame's landmark to one that is retracted now
         for track in self._tracks.values() if freed else ():
             displaced = [
-                s
-                for s in track.settled
-                if (track.identity, s.stamp_ns) in freed
-                and self.landmarks.state(s).outcome is Outcome.REPEATED
+                s for s in track.settled if self._is_displaced_from(s, track, freed)
             ]
             if displaced:
                 reopened += displaced
                 track.reopen(displaced)
-                claims.append(track)
-        for sighting in reopened:
-            is_in_graph = self.landmarks.state(sighting).landmark_id is not None
-            why = Outcome.TAKEN_BACK if is_in_graph else Outcome.WAITING
-            assigned.append(Assignment(sighting, why))
-        yield assigned
+                self._claims.append(track)
+        return Decision.of([*given_up, *map(self._waiting, reopened)])
+
+    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Associate what waits in the tracks that this frame decides.
+
+        Where two tracks claim one landmark in one earlier frame, a sighting that is used already stays. Else that of
+        the track with the more probable row gets it.
+        """
         associated: list[Assignment] = []
         taken_ns: dict[int, set[int]] = {}
-        for track in claims:
+        for track in self._claims:
             if track.waiting and track.identity >= 0:
                 if track.identity not in taken_ns:
                     taken_ns[track.identity] = self.landmarks.stamps_ns(track.identity)
                 associated += self._associate(track, taken_ns[track.identity])
-        yield associated
+        return Decision.of(associated)
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
         """Landmarks of the graph that the detections name."""
@@ -213,27 +220,34 @@ class TrackedIdentities(IdentityPolicy):
             if frame.ids[row] in self.landmarks
         ]
 
-    def judge(self, seen: SeenFrame) -> Decisions:
+    def judge(self, seen: SeenFrame) -> Decision:
         """Use what has an identity, inside the gate if its landmark is in the graph. The rest waits in its track."""
         frame = seen.frame
         named = self._named(frame)
         known = [row for row in named if frame.ids[row] in self.landmarks]
-        judged = self._compared(seen, known) if known else []
+        released: list[int] = []
+        judged = self._compared(seen, known, released) if known else []
         judged += [self._begun(seen, row) for row in named if row not in known]
-        others = [row for row in range(len(frame)) if row not in named]
-        for row, sighting in zip(others, seen.sightings(others), strict=True):
+        others = [row for row in range(len(frame)) if frame.refusals[row] is not None]
+        waiting = seen.sightings(others, seen.beam_points(others)) if others else []
+        for row, sighting in zip(others, waiting, strict=True):
             # repeated: a more probable row of the frame has the landmark
             is_repeated = frame.refusals[row] is Outcome.REPEATED
-            why = Outcome.REPEATED if is_repeated else Outcome.WAITING
-            judged.append(Assignment(sighting, why))
+            judged.append(
+                Assignment(
+                    sighting, Outcome.REPEATED if is_repeated else Outcome.WAITING
+                )
+            )
         track_of = dict(zip(frame.rows, frame.tracks, strict=True))
         for each in judged:
             track = self._tracks.get(track_of[each.sighting.row])
             if track is None:  # a single detection: final
                 continue
-            is_waiting = each.outcome is Outcome.WAITING
-            (track.waiting if is_waiting else track.settled).append(each.sighting)
-        yield judged
+            if each.outcome is Outcome.WAITING:
+                track.waiting.append(each.sighting)
+            else:
+                track.settled.append(each.sighting)
+        return Decision.of(judged, released)
 
     def held(self) -> dict[int, float]:
         """Keyframes of sightings that wait, of tracks that may still be of a landmark."""
@@ -250,22 +264,31 @@ class TrackedIdentities(IdentityPolicy):
         oldest_ns = now_ns - self._longest_wait_ns
         given_up: list[Assignment] = []
         for track in self._tracks.values():
-            is_of_none = track.identity == NO_LANDMARK
-            why = Outcome.NO_IDENTITY if is_of_none else Outcome.FORGOTTEN
-            kept: list[Sighting] = []
-            for sighting in track.waiting:
-                if (
-                    sighting.stamp_ns >= oldest_ns
-                    and sighting.line.pose_key not in left
-                ):
-                    kept.append(sighting)
+            old = {
+                s
+                for s in track.waiting
+                if s.stamp_ns < oldest_ns or s.line.pose_key in left
+            }
+            if old:
+                why = (
+                    Outcome.NO_IDENTITY
+                    if track.identity == NO_LANDMARK
+                    else Outcome.FORGOTTEN
+                )
                 # a retracted sighting stays one
-                elif self.landmarks.state(sighting).outcome is Outcome.WAITING:
-                    given_up.append(Assignment(sighting, why))
-            track.waiting = kept
+                given_up += [
+                    Assignment(s, why)
+                    for s in track.waiting
+                    if s in old and self.landmarks.state(s).outcome is Outcome.WAITING
+                ]
+                track.waiting = [
+                    sighting for sighting in track.waiting if sighting not in old
+                ]
             if left:
                 track.settled = [
-                    s for s in track.settled if s.line.pose_key not in left
+                    sighting
+                    for sighting in track.settled
+                    if sighting.line.pose_key not in left
                 ]
         self._tracks = {
             number: track
@@ -286,6 +309,20 @@ class TrackedIdentities(IdentityPolicy):
             if decisions[row] != UNDECIDED:
                 decided.append((track, decisions[row]))
         return decided
+
+    def _waiting(self, sighting: Sighting) -> Assignment:
+        """Let a sighting wait; one in the graph is retracted."""
+        is_in_graph = self.landmarks.state(sighting).landmark_id is not None
+        return Assignment(
+            sighting, Outcome.TAKEN_BACK if is_in_graph else Outcome.WAITING
+        )
+
+    def _is_displaced_from(
+        self, sighting: Sighting, track: Track, freed: set[tuple[int, int]]
+    ) -> bool:
+        """True when its frame showed the landmark of its track elsewhere, and no longer does."""
+        is_free = (track.identity, sighting.stamp_ns) in freed
+        return is_free and self.landmarks.state(sighting).outcome is Outcome.REPEATED
 
     def _associate(self, track: Track, taken_ns: set[int]) -> list[Assignment]:
         """Judge the waiting sightings of a track; frames that show its landmark already are taken.
@@ -334,8 +371,13 @@ class TrackedIdentities(IdentityPolicy):
         """Detections whose identity is accepted."""
         return [row for row, why in enumerate(frame.refusals) if why is None]
 
-    def _compared(self, seen: SeenFrame, rows: list[int]) -> list[Assignment]:
-        """Use detections of landmarks of the graph that lie inside the gate and do not contradict the map."""
+    def _compared(
+        self, seen: SeenFrame, rows: list[int], released: list[int]
+    ) -> list[Assignment]:
+        """Use detections of landmarks of the graph that lie inside the gate and do not contradict the map.
+
+        Landmarks of the map that have moved are added to ``released``.
+        """
         frame = seen.frame
         keys = [L(frame.ids[row]) for row in rows]
         # (m, 3)
@@ -343,9 +385,10 @@ class TrackedIdentities(IdentityPolicy):
         compared = seen.view.compare(keys, landmarks, frame.z[rows], frame.noise[rows])
         # a sighting of a track may change its landmark, so that its noise must not depend on one
         points = landmarks
-        is_tracked = np.array([frame.tracks[row] != NO_TRACK for row in rows])
-        if is_tracked.any():
-            points = np.where(is_tracked[:, None], seen.beam_points[rows], landmarks)
+        is_tracked = [frame.tracks[row] != NO_TRACK for row in rows]
+        if any(is_tracked):
+            mask = np.array(is_tracked)[:, None]
+            points = np.where(mask, seen.beam_points(rows), landmarks)
         judged = []
         for k, sighting in enumerate(seen.sightings(rows, points)):
             squared = float(compared.distance[k])
@@ -353,6 +396,8 @@ class TrackedIdentities(IdentityPolicy):
             verdict = self.landmarks.known.judge(
                 landmark_id, frame.stamp_ns, compared.innovation[k], compared.S[k]
             )
+            if verdict is Verdict.RELEASE:
+                released.append(landmark_id)
             is_inside = squared <= self._gate and verdict is Verdict.USE
             judged.append(
                 Assignment(
@@ -375,9 +420,10 @@ class TrackedIdentities(IdentityPolicy):
         )
         start = locate(seen.view.world_T_sonar, z[0], z[1], elevation_rad)
         # as in `_compared`: of a track, the sighting must not depend on where this landmark begins
-        is_single = frame.tracks[row] == NO_TRACK
-        of_start = (start[None], elevation_rad) if is_single else ()
-        (sighting,) = seen.sightings([row], *of_start)
+        if frame.tracks[row] == NO_TRACK:
+            (sighting,) = seen.sightings([row], start[None], elevation_rad)
+        else:
+            (sighting,) = seen.sightings([row], seen.beam_points([row]))
         return Assignment(sighting, Outcome.NEW, frame.ids[row], start=start)
 
 

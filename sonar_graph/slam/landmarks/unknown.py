@@ -39,8 +39,9 @@ from sonar_graph.models import (
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
+    UNCHANGED,
     Assignment,
-    Decisions,
+    Decision,
     IdentityPolicy,
     LandmarkGraph,
 )
@@ -117,47 +118,59 @@ def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
     ``probability``: chance that a true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of
     freedom.
     """
-    count = len(innovations.innovation)
-    gates = [0.0] + [
-        chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
-    ]
-    # a pair that is incompatible alone stays so in every pairing; landmarks from near to far
-    possible = [
-        [j for j in np.argsort(row).tolist() if row[j] <= gates[1]]
-        for row in innovations.distances()
-    ]
-    # depth first, detections with the fewest possible landmarks first
-    order = sorted(
-        range(count), key=lambda i: (len(possible[i]) == 0, len(possible[i]))
-    )
-    left = [sum(bool(possible[i]) for i in order[depth:]) for depth in range(count + 1)]
-    """Number of detections at each depth and below that are compatible with a landmark."""
-    best = Pairing((UNPAIRED,) * count, 0.0)
+    search = _Search(innovations, probability)
+    search.branch(0, search.best)
+    return search.best
 
-    def branch(depth: int, part: Pairing) -> None:
+
+class _Search:
+    """Depth first, detections with the fewest possible landmarks first, landmarks from near to far."""
+
+    def __init__(self, innovations: Innovations, probability: float) -> None:
+        count = len(innovations.innovation)
+        self._innovations = innovations
+        self._gates = [0.0] + [
+            chi_square_quantile(probability, 2 * (k + 1)) for k in range(count)
+        ]
+        # a pair that is incompatible alone stays so in every pairing
+        self._possible = [
+            [j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]]
+            for row in innovations.distances()
+        ]
+        self._order = sorted(
+            range(count),
+            key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])),
+        )
+        self._left = [
+            sum(bool(self._possible[i]) for i in self._order[depth:])
+            for depth in range(count + 1)
+        ]
+        """Number of detections at each depth and below that are compatible with a landmark."""
+        self.best = Pairing((UNPAIRED,) * count, 0.0)
+
+    def branch(self, depth: int, part: Pairing) -> None:
         """Try all pairings that extend a part of one."""
-        nonlocal best
-        is_better = (part.size, -part.distance) > (best.size, -best.distance)
-        if is_better and part.distance <= gates[part.size]:
-            best = part
-        if left[depth] == 0:
+        best = self.best
+        if (part.size, -part.distance) > (
+            best.size,
+            -best.distance,
+        ) and part.distance <= self._gates[part.size]:
+            self.best = part
+        if self._left[depth] == 0:
             return
         # bound: D² only grows with pairs, so that a pairing of equal size cannot come below it any more
-        reach = part.size + left[depth]
-        if (reach, -part.distance) <= (best.size, -best.distance):
+        reach = part.size + self._left[depth]
+        if (reach, -part.distance) <= (self.best.size, -self.best.distance):
             return
-        i = order[depth]
-        for j in possible[i]:
+        i = self._order[depth]
+        for j in self._possible[i]:
             if j not in part.landmarks:
-                more = innovations.pairing(
+                more = self._innovations.pairing(
                     (*part.landmarks[:i], j, *part.landmarks[i + 1 :])
                 )
-                if more.distance <= gates[reach]:
-                    branch(depth + 1, more)
-        branch(depth + 1, part)
-
-    branch(0, best)
-    return best
+                if more.distance <= self._gates[reach]:
+                    self.branch(depth + 1, more)
+        self.branch(depth + 1, part)
 
 
 def drop_unlikely(
@@ -265,13 +278,14 @@ Candidate = list[Sighting]
 """Sightings that may be of one landmark, in the order of time."""
 
 
-class PairedLandmark(NamedTuple):
-    """Landmark that a detection was paired with."""
+class PairedDetection(NamedTuple):
+    """Landmark or candidate that a detection was paired with, or neither."""
 
-    landmark_id: int
-    innovation: Floats
-    """Shape (2,)."""
-    S: Floats
+    landmark_id: int | None = None
+    candidate: Candidate | None = None
+    innovation: Floats | None = None
+    """Innovation against the landmark, shape (2,)."""
+    S: Floats | None = None
     """Its covariance, shape (2, 2)."""
 
 
@@ -288,6 +302,8 @@ class NamelessLandmarks(IdentityPolicy):
             min(params.longest_wait_s, self.smoother.params.lag_s - ROUNDING_S), 0.0
         )
         self._candidates: list[Candidate] = []
+        self._grown: list[Candidate] = []
+        """Candidates that the last frame shows."""
         self._next_id = FIRST_ANONYMOUS_ID
 
     def refuse_taken_ids(self, frame: LandmarkDetections) -> None:
@@ -300,59 +316,81 @@ class NamelessLandmarks(IdentityPolicy):
                 ' below that, or give it identity.unknown.policy = "ignore"'
             )
 
-    def revise(self, frame: Frame | None) -> Decisions:  # noqa: ARG002
-        """Give up sightings that have waited too long; then merge the nearest two landmarks that are one."""
-        yield self.forget()
+    def retract(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Give up sightings that have waited too long."""
+        return Decision.of(self.forget())
+
+    def associate(self, frame: Frame | None) -> Decision:  # noqa: ARG002
+        """Merge the nearest two landmarks that are one."""
         ids = self.landmarks.ids
         if len(ids) < 2 or ids[-1] < FIRST_ANONYMOUS_ID:
-            return
+            return UNCHANGED
         joint = self.smoother.joint_covariance(
             [self._keyframes.newest_key, *self._keys()]
         )
         duplicates = nearest_duplicates(
             self.landmarks, self.smoother.estimates, joint, self._params
         )
-        if duplicates is not None:
-            stays, goes = duplicates
-            merged = self.landmarks.sightings(goes)
-            yield [Assignment(s, Outcome.MOVED, stays) for s in merged]
+        if duplicates is None:
+            return UNCHANGED
+        stays, goes = duplicates
+        return Decision.of(
+            Assignment(s, Outcome.MOVED, stays) for s in self.landmarks.sightings(goes)
+        )
 
     def rivals(self, frame: Frame, world_T_sonar: gtsam.Pose3) -> list[int]:  # noqa: ARG002
         """All landmarks, and the keyframes of all candidates."""
         return self._keys()
 
-    def judge(self, seen: SeenFrame) -> Decisions:
-        """Use paired detections; let the others wait, each with its candidate. Candidates that are placed are landmarks."""
+    def judge(self, seen: SeenFrame) -> Decision:
+        """Use paired detections; let the others wait, each with its candidate."""
+        self._grown = []
         rows = list(range(len(seen.frame)))
         paired = self.pair(seen.view, seen.frame.z, seen.frame.noise, seen.taken)
         judged = []
-        grown = []
-        for sighting, pair in zip(seen.sightings(rows), paired, strict=True):
-            if isinstance(pair, PairedLandmark):
+        for sighting, pair in zip(
+            seen.sightings(rows, seen.beam_points(rows)), paired, strict=True
+        ):
+            if pair.landmark_id is not None and pair.S is not None:
                 # S = S_0 + R
                 gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0
-                judged.append(Assignment(sighting, Outcome.USED, *pair, gain))
+                judged.append(
+                    Assignment(
+                        sighting,
+                        Outcome.USED,
+                        pair.landmark_id,
+                        pair.innovation,
+                        pair.S,
+                        gain,
+                    )
+                )
                 continue
-            if pair is None:  # neither near a landmark nor near what waits
-                pair = []
-                self._candidates.append(pair)
-            pair.append(sighting)
-            grown.append(pair)
+            candidate = pair.candidate
+            if candidate is None:  # neither near a landmark nor near what waits
+                candidate = []
+                self._candidates.append(candidate)
+            candidate.append(sighting)
+            self._grown.append(candidate)
             judged.append(Assignment(sighting, Outcome.WAITING))
-        yield judged
-        for candidate in grown:
+        return Decision.of(judged)
+
+    def reconsider(self) -> Decision:
+        """Begin a landmark of the next candidate that is placed well enough."""
+        while self._grown:
+            candidate = self._grown.pop(0)
             if self.is_placed(candidate):
                 self._candidates.remove(candidate)
-                *earlier, newest = candidate
-                placed = [
-                    *(
-                        Assignment(s, Outcome.PLACED_LATER, self._next_id)
-                        for s in earlier
-                    ),
-                    Assignment(newest, Outcome.NEW, self._next_id),
-                ]
+                landmark_id = self._next_id
                 self._next_id += 1
-                yield placed
+                *earlier, newest = candidate
+                later = [
+                    Assignment(sighting, Outcome.PLACED_LATER, landmark_id)
+                    for sighting in earlier
+                ]
+                return Decision.of(
+                    [*later, Assignment(newest, Outcome.NEW, landmark_id)]
+                )
+        return UNCHANGED
 
     def is_placed(self, candidate: Candidate) -> bool:
         """True when a candidate has enough sightings, which place it well enough."""
@@ -387,8 +425,8 @@ class NamelessLandmarks(IdentityPolicy):
 
     def pair(
         self, view: PredictedView, z: Floats, noise: Floats, taken: Set[int]
-    ) -> list[PairedLandmark | Candidate | None]:
-        """Pair each detection of a frame with a landmark, or else with a candidate, or with neither.
+    ) -> list[PairedDetection]:
+        """Pair each detection of a frame with a landmark, or else with a candidate.
 
         Parameters
         ----------
@@ -405,7 +443,7 @@ class NamelessLandmarks(IdentityPolicy):
             source(candidate[-1], values, self.landmarks.factors)
             for candidate in self._candidates
         ]
-        paired: list[PairedLandmark | Candidate | None] = [None] * len(z)
+        paired = [PairedDetection()] * len(z)
         if not keys and not sources:
             return paired
         expected, P = view.expect_jointly(keys, points, sources)
@@ -415,12 +453,15 @@ class NamelessLandmarks(IdentityPolicy):
         innovations = Innovations(e[:, :n], P[: 2 * n, : 2 * n], noise)
         of_landmarks = self._choose(innovations, z)
         for i, j in of_landmarks.items():
-            of_j = slice(2 * j, 2 * j + 2)
-            paired[i] = PairedLandmark(ids[j], e[i, j], P[of_j, of_j] + noise[i])
+            S = (
+                innovations.expected_cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
+                + noise[i]
+            )
+            paired[i] = PairedDetection(ids[j], None, innovations.innovation[i, j], S)
         left = [i for i in range(len(z)) if i not in of_landmarks]
         innovations = Innovations(e[left, n:], P[2 * n :, 2 * n :], noise[left])
         for i, j in self._choose(innovations, z[left]).items():
-            paired[left[i]] = self._candidates[j]
+            paired[left[i]] = PairedDetection(None, self._candidates[j])
         return paired
 
     def _choose(self, innovations: Innovations, z: Floats) -> dict[int, int]:
@@ -454,14 +495,20 @@ def nearest_duplicates(
     noise = {i: _noise_m2(landmarks.any_sighting(i)) for i in landmarks.ids}
     d = np.array([points[a] - points[b] for a, b in pairs])  # (k, 3)
     sigma2 = np.array([max(noise[a], noise[b]) for a, b in pairs])
-    of_a, of_b = (
-        np.array([covariance.rows[L(i)] for i in ids])[:, None] + np.arange(3)
-        for ids in zip(*pairs, strict=True)
+    # (k, 3)
+    of_a = np.array([covariance.rows[L(a)] for a, _ in pairs])[:, None] + np.arange(3)
+    of_b = np.array([covariance.rows[L(b)] for _, b in pairs])[:, None] + np.arange(3)
+
+    def P(i: NDArray[np.int64], j: NDArray[np.int64]) -> Floats:
+        return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
+
+    S = (
+        P(of_a, of_a)
+        + P(of_b, of_b)
+        - P(of_a, of_b)
+        - P(of_b, of_a)
+        + sigma2[:, None, None] * np.eye(3)
     )
-    rows = np.concatenate((of_a, of_b), axis=1)  # (k, 6)
-    P = covariance.matrix[rows[:, :, None], rows[:, None, :]]  # (k, 6, 6)
-    apart = np.hstack((np.eye(3), -np.eye(3)))
-    S = apart @ P @ apart.T + sigma2[:, None, None] * np.eye(3)
     # d' S^-1 d
     distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
     for k in np.argsort(distance).tolist():

@@ -11,10 +11,10 @@ sightings start it again (docs/theory/isam2.md).
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -40,13 +40,25 @@ DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
 
 
+class Stack(Protocol):
+    """Many factors of one kind, evaluated as arrays."""
+
+    def __init__(self, factors: Sequence[Any]) -> None: ...
+
+    def error(self, values: gtsam.Values) -> float:
+        """Half the sum of squared whitened errors."""
+
+    def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
+        """What linearising each of them gives."""
+
+
 class StackedGraph:
-    """A graph whose factors in Python are evaluated together, by the `Stack` that their class names."""
+    """A graph whose factors in Python are evaluated together, where their class has a `Stack`."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
         self.factors = [graph.at(i) for i in range(graph.size())]
         self._rest = gtsam.NonlinearFactorGraph()
-        kinds: dict[Any, list[gtsam.NonlinearFactor]] = defaultdict(list)
+        kinds: dict[type[Stack], list[gtsam.NonlinearFactor]] = defaultdict(list)
         for factor in self.factors:
             if kind := getattr(factor, "Stack", None):
                 kinds[kind].append(factor)
@@ -63,9 +75,10 @@ class StackedGraph:
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """All factors, linearised."""
         linear = self._rest.linearize(values)
-        for stack in self._stacks:
-            for factor in stack.linear_factors(values):
-                linear.push_back(factor)
+        for factor in (
+            factor for stack in self._stacks for factor in stack.linear_factors(values)
+        ):
+            linear.push_back(factor)
         return linear
 
 
@@ -159,6 +172,14 @@ def doubled(
         error = further_error
 
 
+def prior_of(key: int, weight: float) -> gtsam.JacobianFactor:
+    """A linear factor by which a variable stays where it is, each component with a standard deviation of 1 / weight."""
+    n = tangent_size(key)
+    return gtsam.JacobianFactor(
+        key, weight * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)
+    )
+
+
 def damped_step(
     linear: gtsam.GaussianFactorGraph,
     values: gtsam.Values,
@@ -171,10 +192,7 @@ def damped_step(
     if damping > FIRST_DAMPING:
         damped = linear.clone()
         for key in linear.keyVector():
-            n = tangent_size(key)
-            unit = gtsam.noiseModel.Unit.Create(n)
-            A = np.sqrt(damping) * np.eye(n)
-            damped.push_back(gtsam.JacobianFactor(key, A, np.zeros(n), unit))
+            damped.push_back(prior_of(key, np.sqrt(damping)))
     try:
         return damped.eliminateSequential(ordering).optimize()
     except RuntimeError:  # Cholesky refuses what is determined, but weakly
@@ -291,6 +309,38 @@ class JointCovariance:
         """The block of two variables."""
         i, j = self.rows[a], self.rows[b]
         return self.matrix[i : i + tangent_size(a), j : j + tangent_size(b)]
+
+
+class KeptCovariance:
+    """One joint covariance for all questions between two updates.
+
+    Each joint covariance costs an elimination of most of the map, however small it is. So the first one after an update
+    includes the landmarks that the next frame is likely to show.
+    """
+
+    def __init__(self) -> None:
+        self._joint: JointCovariance | None = None
+        self._asked: set[int] = set()
+
+    def of(
+        self,
+        marginals: Marginals | gtsam.ISAM2,
+        keys: list[int],
+        likely: Callable[[], list[int]],
+    ) -> JointCovariance:
+        """Joint covariance of these variables, and possibly of more; ``likely`` names those that are needed next."""
+        # the next joint covariance includes all variables since the update, so that no question is repeated
+        self._asked.update(keys)
+        if self._joint is None or not self._joint.rows.keys() >= self._asked:
+            self._joint = JointCovariance.of(
+                marginals, sorted(self._asked.union(likely()))
+            )
+        return self._joint
+
+    def renew(self) -> None:
+        """The graph has changed."""
+        self._joint = None
+        self._asked = set()
 
 
 class Marginals:

@@ -249,7 +249,11 @@ class FactorStore:
         self.gone = set()
         self._new_graph = None
 
-    def graph(self, left_out: Container[int | None] = ()) -> gtsam.NonlinearFactorGraph:
+    def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
+        """Factors of some groups."""
+        return [factor for handle in handles for factor in self.groups[handle]]
+
+    def graph(self, left_out: Container[int] = ()) -> gtsam.NonlinearFactorGraph:
         """All factors but those of some handles."""
         return graph_of(
             group for handle, group in self.groups.items() if handle not in left_out
@@ -281,6 +285,6 @@ def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:
     """Graph of the factors of some groups, in their order."""
     graph = gtsam.NonlinearFactorGraph()
     for group in groups:
-        for factor in group:
+        for factor in group.factors.values():
             graph.add(factor)
     return graph

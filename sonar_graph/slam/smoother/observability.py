@@ -18,13 +18,7 @@ import numpy as np
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.factor_store import (
-    BIAS,
-    LANDMARK,
-    POSE,
     FactorStore,
-    is_landmark,
-    is_pose,
-    kind,
     tangent_size,
     variable_name,
 )
@@ -38,14 +32,14 @@ RANK_LIMIT = 1e-9
 OPEN_SHARE = 1e-3
 """Share of a unit vector v from which on a variable takes part in it."""
 AXES = {
-    POSE: ("roll", "pitch", "yaw", "forward", "left", "up"),
-    LANDMARK: ("x", "y", "z"),
-    BIAS: ("about x", "about y", "about z"),
+    "x": ("roll", "pitch", "yaw", "forward", "left", "up"),
+    "l": ("x", "y", "z"),
+    "b": ("about x", "about y", "about z"),
 }
 MISSING = {
-    LANDMARK: "an elevation, a floor prior or a view from elsewhere is missing",
-    BIAS: "a prior or a walk from another bias is missing",
-    POSE: "odometry from another keyframe or a prior is missing",
+    "l": "an elevation, a floor prior or a view from elsewhere is missing",
+    "b": "a prior or a walk from another bias is missing",
+    "x": "odometry from another keyframe or a prior is missing",
 }
 SPOILT = "gives an error that is no number"
 
@@ -60,7 +54,7 @@ class Open:
 
     def axes(self) -> str:
         """Name of the axis nearest to each direction, with its components where it is not the axis itself."""
-        names, found = AXES[kind(self.key)], []
+        names, found = AXES[chr(gtsam.symbolChr(self.key))], []
         for direction in self.directions:
             nearest = int(np.argmax(np.abs(direction)))
             shares = f"mostly {names[nearest]} ({', '.join(f'{share:.2f}' for share in direction)})"
@@ -190,7 +184,7 @@ class Blame:
         return [
             self._without(open_)
             for key in self._new_keys
-            if not is_pose(key)
+            if gtsam.symbolChr(key) != ord("x")
             for open_ in left_open(self.graph, values, [key], least_said)
         ]
 
@@ -211,7 +205,10 @@ class Blame:
                 graph.add(factor)
         found: list[Withheld] = []
         for open_ in left_open(graph, values, sorted(inside)):
-            if is_pose(open_.key) or open_.key not in self._new_keys:
+            if (
+                gtsam.symbolChr(open_.key) == ord("x")
+                or open_.key not in self._new_keys
+            ):
                 raise EstimatorError(
                     f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}"
                 )
@@ -265,7 +262,7 @@ class Blame:
 
     def _explained(self, open_: Open, factors: list[Labelled]) -> str:
         """Variable, its factors, the open directions, and what would close them, in words."""
-        missing = MISSING[kind(open_.key)]
+        missing = MISSING[chr(gtsam.symbolChr(open_.key))]
         return f"{self._told(factors, open_.key)}; open: {open_.axes()}; {missing}"
 
     def _told(self, factors: list[Labelled], key: int | None = None) -> str:
@@ -275,15 +272,26 @@ class Blame:
         """
         keys = [list(factor.keys()) for _, factor in factors]
         if key is None:
-            key = max(keys[0], key=is_landmark)
-        keyframes = sorted({k for ks in keys for k in ks if is_pose(k)})
+            key = max(keys[0], key=lambda k: gtsam.symbolChr(k) == ord("l"))
+        is_pose = gtsam.symbolChr(key) == ord("x")
+        keyframes = (
+            [key]
+            if is_pose
+            else sorted(
+                {k for ks in keys for k in ks if gtsam.symbolChr(k) == ord("x")}
+            )
+        )
         at = ", ".join(
             f"{variable_name(k)} at {self._times_s[k]:.3f} s"
-            for k in ([key] if is_pose(key) else keyframes)
+            for k in keyframes
             if k in self._times_s
         )
-        name = variable_name(key)
-        if at:
-            name = at if is_pose(key) else f"{name}, from {at}"
+        name = (
+            at
+            if is_pose and at
+            else f"{variable_name(key)}, from {at}"
+            if at
+            else variable_name(key)
+        )
         counts = Counter(label for label, _ in factors)
         return f"{name}: {', '.join(f'{count} {label}' for label, count in counts.items()) or 'no factor'}"

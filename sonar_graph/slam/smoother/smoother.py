@@ -12,9 +12,9 @@ decreases the error and is kept.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -25,6 +25,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
+    KeptCovariance,
     Marginals,
     misplaced,
     solve_in_sight,
@@ -122,6 +123,16 @@ class BoundedHistory(Section):
 HistoryParams = Annotated[WholeHistory | BoundedHistory, *tagged("policy", "whole")]
 
 
+class Departures(Protocol):
+    """Takes note of variables before they leave a bounded window for good."""
+
+    def leave(
+        self, keys: set[int], values: "Estimates", marginals: gtsam.ISAM2
+    ) -> None:
+        """Variables that leave, with estimates and covariances of the window, as long as they are in it."""
+        ...
+
+
 class Changed(NamedTuple):
     """Changes of the graph by an update or an exchange."""
 
@@ -168,8 +179,12 @@ class Estimates:
         return (
             self._window is not None
             and key not in self._gone
-            and self._window.linearised_at.exists(key)
+            and self._window.holds(key)
         )
+
+    def is_taken_up(self, key: int) -> bool:
+        """True for a variable that is in the window, not only about to be."""
+        return self.exists(key) and not self.new.exists(key)
 
     def _at(self, key: int) -> Any:
         # a frame uses the same few variables several times
@@ -211,9 +226,8 @@ class Smoother:
         Settings.
     history
         What is kept of poses older than the lag.
-    take_leave
-        Called with the variables that leave a bounded window, and with its estimates and covariances, as long as they are
-        in it.
+    departures
+        Takes note of variables that leave a bounded history.
     range_sigma_m
         Noise of the sonar's range, which bounds the threshold of positions (`MOST_NOISE_SHARE`).
     """
@@ -221,19 +235,19 @@ class Smoother:
     def __init__(
         self,
         params: SmootherParams,
-        history: HistoryParams,
-        take_leave: Callable[[set[int], Estimates, gtsam.ISAM2], None],
-        range_sigma_m: float,
+        history: HistoryParams | None = None,
+        departures: Departures | None = None,
+        range_sigma_m: float = np.inf,
     ) -> None:
         self.params = params
         position_m = min(params.relinearize_threshold, MOST_NOISE_SHARE * range_sigma_m)
         self._thresholds = Thresholds(position_m, params.relinearize_threshold)
-        self.history = history
+        self.history = history or WholeHistory()
         self.estimates = Estimates()
         """The newest estimate of every variable in the window."""
         self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
         """Messages about factors that were withheld, and why."""
-        self._take_leave = take_leave
+        self._departures = departures
         self._store = FactorStore()
         self._is_by_qr = False
         self._waiting_gain = 0.0
@@ -253,17 +267,17 @@ class Smoother:
         self._left: set[int] = set()
         self._tested: dict[int, int] = {}
         """Number of sightings of a landmark when it was last tested (`_has_misplaced`)."""
-        self._joint: JointCovariance | None = None
-        """One joint covariance for all questions between two updates."""
-        self._asked: set[int] = set()
+        self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, Marginals] | None = None
         self._window = self._empty_window()
         self._taken_up = gtsam.NonlinearFactorGraph()
 
     def _empty_window(self) -> WholeWindow | FixedLagWindow:
-        is_bounded = isinstance(self.history, BoundedHistory)
-        kind = FixedLagWindow if is_bounded else WholeWindow
-        return kind(self._thresholds, is_by_qr=self._is_by_qr)
+        if isinstance(self.history, BoundedHistory):
+            return FixedLagWindow(
+                self._thresholds, self.params.lag_s, is_by_qr=self._is_by_qr
+            )
+        return WholeWindow(self._thresholds, is_by_qr=self._is_by_qr)
 
     # ---------------------------------------------------------------- what the graph is made of
 
@@ -290,9 +304,14 @@ class Smoother:
         """The newest estimate of all variables in the window; a copy."""
         return self.estimates.all()
 
-    def graph_without(self, handles: set[int | None]) -> gtsam.NonlinearFactorGraph:
+    def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
         """Every factor of a run with a whole history but those of some handles."""
         return self._store.graph(left_out=handles)
+
+    @property
+    def landmark_ids(self) -> list[int]:
+        """Identities of the landmarks in the graph, ascending."""
+        return sorted(gtsam.Symbol(key).index() for key in self._landmarks)
 
     def in_window(self, keys: list[int]) -> list[int]:
         """Keys of variables that are in the window, or about to be."""
@@ -362,25 +381,26 @@ class Smoother:
             or self._waiting_gain > self.params.waiting_gain
         )
 
-    def update(self) -> Changed:
+    def update(self, time_s: float) -> Changed:
         """Update the window with all that was added; variables older than the lag leave a bounded one."""
         # where all that was new is withheld there is nothing to update
         if not self._withhold_unusable() or self.is_due:
-            self._update(self._lag_s())
+            self._update(time_s, self._lag_at(time_s))
         return self._changed()
 
-    def flush(self) -> Changed:
+    def flush(self, time_s: float) -> Changed:
         """Update with the factors that wait, if any; a bounded window keeps its variables."""
-        self._flush()
+        self._flush(time_s)
         return self._changed()
 
-    def _flush(self) -> None:
+    def _flush(self, time_s: float) -> None:
         self._withhold_unusable()
         if self._store.new:
-            self._update(np.inf)
+            self._update(time_s, self._lag_that_keeps_all(time_s))
 
     def exchange(
         self,
+        time_s: float,
         removed: Sequence[int] = (),
         added: Sequence[FactorGroup] = (),
         new_landmarks: Mapping[int, Floats] | None = None,
@@ -391,7 +411,7 @@ class Smoother:
         New landmarks come with first estimates. Lost are the landmarks that keep no factor.
         """
         # handles of removed groups must be known to the window
-        self._flush()
+        self._flush(time_s)
         self._store.remove(removed)
         self._removed.extend(removed)
         self._forget(lost_landmarks)
@@ -401,16 +421,16 @@ class Smoother:
         self._withhold_unusable()
         if lost_landmarks and self.is_bounded:
             # GTSAM's fixed-lag smoother keeps a variable that lost its factors: begin again without it
-            self._restart()
+            self._restart(time_s)
         else:
-            self._update(np.inf)
+            self._update(time_s, self._lag_that_keeps_all(time_s))
             # a changed identity may move the estimate farther than one step reaches
-            self.settle()
+            self.settle(time_s)
         return self._changed(handles)
 
-    def settle(self) -> None:
+    def settle(self, time_s: float) -> None:
         """Gauss-Newton steps until no landmark and not the newest keyframe would be relinearised (`MOST_STEPS`)."""
-        self._iterate(self.params.relinearize_threshold)
+        self._iterate(time_s, self.params.relinearize_threshold)
 
     def _changed(self, added: Sequence[int] = ()) -> Changed:
         """Changes since the last answer."""
@@ -419,53 +439,65 @@ class Smoother:
         self._left = set()
         return changed
 
-    def _lag_s(self) -> float:
-        """Age from which poses leave a bounded window; held keyframes stay."""
-        now_s = self._newest_s
-        held = [key for key, until_s in self._held.items() if now_s <= until_s]
-        ages_s = [now_s - self._times_s[key] + ROUNDING_S for key in held]
+    def _lag_at(self, time_s: float) -> float:
+        """Age (s) from which poses leave a bounded window; held keyframes stay."""
+        if not isinstance(self.history, BoundedHistory):
+            return np.inf
+        held = [key for key, until_s in self._held.items() if time_s <= until_s]
+        ages_s = [time_s - self._times_s[key] + ROUNDING_S for key in held]
         return max([self.params.lag_s, *ages_s])
 
-    def _update(self, lag_s: float) -> None:
+    def _lag_that_keeps_all(self, time_s: float) -> float:
+        """Age (s) at which no variable leaves the window, for example while factors are being exchanged."""
+        if not self.is_bounded:
+            return np.inf
+        ages_s = [time_s - t + ROUNDING_S for t in self._times_s.values()]
+        return max([self._lag_at(time_s), *ages_s])
+
+    def _update(self, time_s: float, lag_s: float) -> None:
         """Update the window with all that is new, and iterate after a large step."""
         self._solved = None  # an earlier question must not decide where the next batch solution starts
-        now_s = self._newest_s
+        relinearises = (
+            time_s >= self._relinearised_s + self.params.relinearize_interval_s
+        )
         seen = self._store.newly_seen()
         # GTSAM counts updates, but their rate depends on what the sonar sees
-        relinearises = (
-            now_s >= self._relinearised_s + self.params.relinearize_interval_s
-        )
         if relinearises:
-            self._relinearised_s = now_s
-        if not self._step(lag_s, relinearises=relinearises):
+            self._relinearised_s = time_s
+        is_solved = self._step(time_s, lag_s, relinearises=relinearises)
+        if not is_solved:
             return
-        self._iterate(LEAST_ITERATED)
-        if self.is_bounded:
-            # marginals stay linearised where their poses left
-            shift_m = self._largest_shift(self._landmarks)
+        self._iterate(time_s, LEAST_ITERATED)
+        if not self.is_bounded and self._has_misplaced(seen):
+            self._restart(time_s)
+        # marginals of a bounded window stay linearised where their poses left
+        if isinstance(self._window, FixedLagWindow):
+            may_restart = time_s >= self._restarted_s + self.params.lag_s
             if (
-                now_s >= self._restarted_s + self.params.lag_s
-                and shift_m > self.params.stale_shift_m
+                may_restart
+                and self._window.largest_shift(self._landmarks)
+                > self.params.stale_shift_m
             ):
-                self._restart()
-        elif self._has_misplaced(seen):
-            self._restart()
+                self._restart(time_s)
 
-    def _iterate(self, least: float) -> None:
+    def _iterate(self, time_s: float, least: float) -> None:
         """Further Gauss-Newton steps while the last one was large (rad or m); a restart where they diverge."""
         for _ in range(MOST_STEPS):
             step = self._largest_step()
             # not <= : also where the step is no number
             if not step <= LEAST_SUSPICIOUS and self._has_diverged():
-                self._restart()
+                self._restart(time_s)
                 return
             if step <= least:
                 return
             # old variables left in the first step of this update: keep the others
-            if not self._step(np.inf, relinearises=True):
+            is_solved = self._step(
+                time_s, self._lag_that_keeps_all(time_s), relinearises=True
+            )
+            if not is_solved:
                 return
 
-    def _step(self, lag_s: float, *, relinearises: bool) -> bool:
+    def _step(self, time_s: float, lag_s: float, *, relinearises: bool) -> bool:
         """One Gauss-Newton step of the window; False where it failed, and the window was restarted."""
         window = self._window
         store = self._store
@@ -481,19 +513,14 @@ class Smoother:
                 )
             else:
                 # their covariances exist only before the update
-                self._say_farewell(self._newest_s - lag_s)
+                self._take_leave(time_s - lag_s)
+                times_s = self._used_at(time_s)
                 window.update(
-                    store.new,
-                    self.estimates.new,
-                    self._last_used(),
-                    lag_s,
-                    removed=self._removed,
+                    store.new, self.estimates.new, times_s, lag_s, removed=self._removed
                 )
         except RuntimeError:
-            if not self._go_without():
-                # Cholesky failed on a pose that is far less certain than its step
-                self._is_by_qr = True
-                self._restart()
+            if not self._go_without(time_s):
+                self._give_up_cholesky(time_s)
             return False
         self._clear_new()
         return True
@@ -504,8 +531,7 @@ class Smoother:
         self._removed = []
         self._waiting_gain = 0.0
         self.estimates.renew(self._window)
-        self._joint = None
-        self._asked = set()
+        self._kept_covariance.renew()
         if isinstance(self._window, FixedLagWindow):
             self._leave(self._window)
 
@@ -516,11 +542,7 @@ class Smoother:
         keys = list(self._landmarks)
         if self._newest_pose is not None:
             keys.append(self._newest_pose)
-        return self._largest_shift(keys)
-
-    def _largest_shift(self, keys: list[int]) -> float:
-        """Largest component by which some variables have moved from their linearisation point, rad or m."""
-        return float(np.abs(self._window.delta().vector(keys)).max()) if keys else 0.0
+        return self._window.largest_shift(keys)
 
     def _has_diverged(self) -> bool:
         """True when the estimate has a larger error than the linearisation point, from which the step started."""
@@ -544,14 +566,16 @@ class Smoother:
                 self._tested[key] = count
         return bool(misplaced(self.estimates, due))
 
-    def _restart(self) -> None:
+    def _restart(self, time_s: float) -> None:
         """Begin the window again at the batch solution of the graph."""
         graph = self.graph
         values = solve_in_sight(graph, self._before_update(), self._store.sightlines())
-        self._restarted_s = self._newest_s
-        self._begin(graph, values)
+        self._restarted_s = time_s
+        self._begin(graph, values, time_s)
 
-    def _begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def _begin(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, time_s: float
+    ) -> None:
         """Begin a new window with all groups of factors at given values; `EstimatorError` where that is impossible."""
         # QR last: it refuses only what is not determined
         for is_by_qr in (self._is_by_qr, True):
@@ -561,7 +585,9 @@ class Smoother:
                 if isinstance(window, WholeWindow):
                     window.begin(self._store.groups, values)
                 else:
-                    window.begin(graph, self._store.groups, values, self._last_used())
+                    window.begin(
+                        graph, self._store.groups, values, self._kept_at(time_s)
+                    )
                 break
             except RuntimeError as error:
                 if is_by_qr:
@@ -573,14 +599,19 @@ class Smoother:
 
     # ---------------------------------------------------------------- a bounded history
 
-    def _last_used(self) -> dict[int, float]:
+    def _used_at(self, time_s: float) -> dict[int, float]:
         """Times at which the variables of a bounded window were last used: landmarks and newest biases now."""
         if self._newest_bias is not None:
-            self._times_s[self._newest_bias] = self._newest_s
-        return self._times_s | dict.fromkeys(self._landmarks, self._newest_s)
+            self._times_s[self._newest_bias] = time_s
+        return self._times_s | dict.fromkeys(self._landmarks, time_s)
 
-    def _say_farewell(self, oldest_s: float) -> None:
-        """Name the variables that the next update marginalises."""
+    def _kept_at(self, time_s: float) -> dict[int, float]:
+        """Variables of a bounded window that begins again, and when they were last used."""
+        oldest_s = time_s - self._lag_that_keeps_all(time_s)
+        return {key: t for key, t in self._used_at(time_s).items() if t >= oldest_s}
+
+    def _take_leave(self, oldest_s: float) -> None:
+        """Let `Departures` take note of the variables that the next update marginalises."""
         leaving = {
             key
             for key, t in self._times_s.items()
@@ -588,13 +619,12 @@ class Smoother:
         }
         # the biases in use are older than the poses that they hold for
         leaving.discard(self._newest_bias)
-        if leaving:
-            self._take_leave(leaving, self.estimates, self.marginals)
+        if leaving and self._departures is not None:
+            self._departures.leave(leaving, self.estimates, self.marginals)
 
     def _leave(self, window: FixedLagWindow) -> None:
         """Forget variables that left a bounded window, and the groups of factors that left with them."""
-        inside = window.linearised_at
-        left = [key for key in self._times_s if not inside.exists(key)]
+        left = [key for key in self._times_s if not window.holds(key)]
         for key in left:
             del self._times_s[key]
         self._left.update(left)
@@ -635,7 +665,7 @@ class Smoother:
             if key in self._landmarks:
                 self._landmarks.remove(key)
 
-    def _go_without(self) -> bool:
+    def _go_without(self, time_s: float) -> bool:
         """Solve the window without the new factors that made its update fail; True if there were any."""
         values = self._before_update()
         # the window was solved without the new factors, so that the fault is in them
@@ -651,8 +681,13 @@ class Smoother:
         for withheld in found:
             for key in withheld.keys:
                 values.erase(key)
-        self._begin(self.graph, values)
+        self._begin(self.graph, values, time_s)
         return True
+
+    def _give_up_cholesky(self, time_s: float) -> None:
+        """Continue by QR: Cholesky failed on a pose that is far less certain than its step."""
+        self._is_by_qr = True
+        self._restart(time_s)
 
     def _before_update(self) -> gtsam.Values:
         """Values before a failed or diverged update: the linearisation point, near the last good estimate.
@@ -669,19 +704,12 @@ class Smoother:
         return self._window.isam
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
-        """Joint marginal covariance of variables in the window, and possibly of more of them.
+        """Joint marginal covariance of variables in the window, and possibly of more of them."""
+        return self._kept_covariance.of(self.marginals, keys, self._likely)
 
-        Each costs an elimination of most of the map, however small it is. So one contains all variables that were asked for
-        since the update, and the landmarks that the next frame is likely to show.
-        """
-        self._asked.update(keys)
-        if self._joint is None or not self._joint.rows.keys() >= self._asked:
-            new = self.estimates.new
-            likely = self.in_window([k for k in self._in_reach if not new.exists(k)])
-            self._joint = JointCovariance.of(
-                self.marginals, sorted(self._asked.union(likely))
-            )
-        return self._joint
+    def _likely(self) -> list[int]:
+        """Landmarks in the window that the next frame may show."""
+        return [key for key in self._in_reach if self.estimates.is_taken_up(key)]
 
     def _asked_next(self) -> list[int]:
         """Variables whose covariance is needed next: newest keyframe and biases, and landmarks in reach."""

@@ -216,9 +216,16 @@ class WholeWindow:
         kept = {handle: beside[handle] for handle in sorted(beside.keys() - removed)}
         return sorted(slots), kept
 
-    def delta(self) -> gtsam.VectorValues:
-        """Change of each variable since its linearisation point; a reference."""
-        return self.isam.getDelta()
+    def holds(self, key: int) -> bool:
+        """True for a variable in the window."""
+        return self.isam.valueExists(key)
+
+    def largest_shift(self, keys: Sequence[int]) -> float:
+        """Largest component by which some variables have moved from their linearisation point, rad or m."""
+        if not keys:
+            return 0.0
+        # GTSAM returns a reference, not a copy
+        return float(np.abs(self.isam.getDelta().vector(keys)).max())
 
     def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
         """Estimate of some variables, or of all."""
@@ -228,18 +235,27 @@ class WholeWindow:
 
 
 class FixedLagWindow:
-    """GTSAM's fixed-lag smoother: iSAM2 over the last seconds, with the marginal of all that is older."""
+    """GTSAM's fixed-lag smoother: iSAM2 over the last seconds, with the marginal of all that is older.
 
-    def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
+    Parameters
+    ----------
+    thresholds
+        Changes of a variable above which it is relinearised.
+    lag_s
+        Age from which variables are marginalised.
+    """
+
+    def __init__(
+        self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False
+    ) -> None:
         self._params = isam2_params(thresholds, is_by_qr=is_by_qr)
         # the window is small: every update may relinearise
         self._params.relinearizeSkip = 1
         self._is_by_qr = is_by_qr
-        self._begin_empty()
+        self._begin_empty(lag_s)
 
-    def _begin_empty(self) -> None:
-        # each update has its own lag; at a restart nothing leaves
-        self._fixed_lag = gtsam.IncrementalFixedLagSmoother(np.inf, self._params)
+    def _begin_empty(self, lag_s: float) -> None:
+        self._fixed_lag = gtsam.IncrementalFixedLagSmoother(lag_s, self._params)
         # held as in `WholeWindow`
         self.linearised_at = self._fixed_lag.getLinearizationPoint()
         self._slots: dict[int, list[int]] = {}
@@ -278,7 +294,7 @@ class FixedLagWindow:
         if outside.size():
             for factor in marginal(outside, values, times_s, is_by_qr=self._is_by_qr):
                 inside.add(factor)
-        self._begin_empty()
+        self._begin_empty(self._fixed_lag.smootherLag())
         self._fixed_lag.update(inside, picked(values, times_s), dict(times_s))
         self._slots = {
             handle: [slot_of[factor] for factor in group if factor in slot_of]
@@ -312,9 +328,14 @@ class FixedLagWindow:
         """The solver inside, for covariances; a copy."""
         return self._fixed_lag.getISAM2()
 
-    def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:  # noqa: ARG002
-        """Estimate of all variables, since GTSAM's smoother gives no part of it."""
-        return self._fixed_lag.calculateEstimate()
+    def holds(self, key: int) -> bool:
+        """True for a variable in the window."""
+        return self.linearised_at.exists(key)
+
+    def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
+        """Estimate of some variables, or of all."""
+        values = self._fixed_lag.calculateEstimate()
+        return values if keys is None else picked(values, keys)
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """Marginals and factors of the window.
@@ -339,9 +360,11 @@ class FixedLagWindow:
                 graph.add(factor)
         return graph
 
-    def delta(self) -> gtsam.VectorValues:
-        """Change of each variable since its linearisation point."""
-        return self._fixed_lag.getDelta()
+    def largest_shift(self, keys: Sequence[int]) -> float:
+        """Largest component by which some variables have moved from their linearisation point, rad or m."""
+        if not keys:
+            return 0.0
+        return float(np.abs(self._fixed_lag.getDelta().vector(keys)).max())
 
 
 def marginal(
