@@ -7,7 +7,12 @@ import pytest
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import MissionOptions, simulate_mission
+from sonar_graph.simulation import (
+    BasinOptions,
+    MissionOptions,
+    simulate_basin,
+    simulate_mission,
+)
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate, Outcome
 
@@ -137,3 +142,20 @@ def test_what_need_not_be_remembered_is_forgotten_and_nothing_else_changes():
     assert np.array_equal(
         recent.landmarks().positions, everything.landmarks().positions
     )
+
+
+def test_what_waits_keeps_its_keyframe_when_the_window_begins_again():
+    """A window that began again in an exchange let go of keyframes older than the lag, and the run stopped."""
+    options = BasinOptions(
+        duration_s=150.0,
+        laps=1,
+        seed=3,
+        tracks=True,
+        id_delay_s=2.0,
+        wrong_id_rate=1.0,
+        wrong_id_share=0.6,
+        anonymous_share=0.3,
+        false_detections_per_frame=0.1,
+    )
+    _, estimates = run(simulate_basin(options), "bounded", smoother__lag_s=4.0)
+    assert len(estimates) > 200

@@ -61,7 +61,7 @@ def test_a_window_counts_factors_outside_of_it_once(outside, variance_m2, is_by_
     solved.insert(L(3), ORIGIN)
     inside = graph_of([point_prior(L(2), ORIGIN, WEAK_M), near(2, 3, 0.1)])
     inside.push_back(outside)
-    window = FixedLagWindow(Thresholds(1e-6, 1e-6), 1e9, is_by_qr=is_by_qr)
+    window = FixedLagWindow(Thresholds(1e-6, 1e-6), is_by_qr=is_by_qr)
     window.begin(inside, {}, solved, {L(2): 0.0, L(3): 0.0})
     expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / variance_m2)
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(

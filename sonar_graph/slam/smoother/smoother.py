@@ -274,9 +274,7 @@ class Smoother:
 
     def _empty_window(self) -> WholeWindow | FixedLagWindow:
         if isinstance(self.history, BoundedHistory):
-            return FixedLagWindow(
-                self._thresholds, self.params.lag_s, is_by_qr=self._is_by_qr
-            )
+            return FixedLagWindow(self._thresholds, is_by_qr=self._is_by_qr)
         return WholeWindow(self._thresholds, is_by_qr=self._is_by_qr)
 
     # ---------------------------------------------------------------- what the graph is made of

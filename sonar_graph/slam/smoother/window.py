@@ -235,27 +235,18 @@ class WholeWindow:
 
 
 class FixedLagWindow:
-    """GTSAM's fixed-lag smoother: iSAM2 over the last seconds, with the marginal of all that is older.
+    """GTSAM's fixed-lag smoother: iSAM2 over the last seconds, with the marginal of all that is older."""
 
-    Parameters
-    ----------
-    thresholds
-        Changes of a variable above which it is relinearised.
-    lag_s
-        Age from which variables are marginalised.
-    """
-
-    def __init__(
-        self, thresholds: Thresholds, lag_s: float, *, is_by_qr: bool = False
-    ) -> None:
+    def __init__(self, thresholds: Thresholds, *, is_by_qr: bool = False) -> None:
         self._params = isam2_params(thresholds, is_by_qr=is_by_qr)
         # the window is small: every update may relinearise
         self._params.relinearizeSkip = 1
         self._is_by_qr = is_by_qr
-        self._begin_empty(lag_s)
+        self._begin_empty()
 
-    def _begin_empty(self, lag_s: float) -> None:
-        self._fixed_lag = gtsam.IncrementalFixedLagSmoother(lag_s, self._params)
+    def _begin_empty(self) -> None:
+        # each update has its own lag; at a restart nothing leaves
+        self._fixed_lag = gtsam.IncrementalFixedLagSmoother(np.inf, self._params)
         # held as in `WholeWindow`
         self.linearised_at = self._fixed_lag.getLinearizationPoint()
         self._slots: dict[int, list[int]] = {}
@@ -294,7 +285,7 @@ class FixedLagWindow:
         if outside.size():
             for factor in marginal(outside, values, times_s, is_by_qr=self._is_by_qr):
                 inside.add(factor)
-        self._begin_empty(self._fixed_lag.smootherLag())
+        self._begin_empty()
         self._fixed_lag.update(inside, picked(values, times_s), dict(times_s))
         self._slots = {
             handle: [slot_of[factor] for factor in group if factor in slot_of]
