@@ -380,7 +380,8 @@ def start_heading_finding(
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
     of_tilt = ""
     if tilt.tilt is not None:
-        roll, pitch = tilt.tilt.roll_rad, tilt.tilt.pitch_rad
+        roll = tilt.tilt.roll_rad
+        pitch = tilt.tilt.pitch_rad
         of_tilt = f", with roll and pitch {tilt.said}"
     near_ns = at_ns + np.array([-1, 1]) * (TURN_OVER_NS // 2)
     near_ns = np.clip(near_ns, first_ns, last_ns)

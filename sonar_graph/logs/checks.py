@@ -620,7 +620,8 @@ def stuck_rows(quantity: str, rows: Mapping[str, tuple[Ints, Floats]]) -> Mask:
     if quantity == "velocity":
         chosen &= values[runs.first].any(axis=1)
     for run in np.flatnonzero(chosen).tolist():
-        begin_ns, end_ns = stamps_ns[[runs.first[run], runs.last[run]]]
+        begin_ns = stamps_ns[runs.first[run]]
+        end_ns = stamps_ns[runs.last[run]]
         chosen[run] = all(
             _changes(*others, begin_ns, end_ns)
             for name, others in rows.items()
