@@ -238,8 +238,12 @@ def outcome(path: Path) -> Outcome:
         with patch(
             "time.perf_counter", time.process_time
         ):  # other processes do not count
-            prepared = prepared_log(path, ReadingOptions(), RecogniserOptions(), 2.0)
-            comparison = compare_prepared(prepared, ESTIMATORS, {})
+            sequence, recognition = prepared_log(
+                path, ReadingOptions(), RecogniserOptions()
+            )
+            comparison = compare_prepared(
+                sequence, recognition, ESTIMATORS, {}, rate_hz=None
+            )
     except SonarGraphError as error:
         return Outcome(str(error), {}, {}, {}, str(error))
     console = Console(file=StringIO(), width=10_000)
