@@ -23,7 +23,7 @@ FOLDER = Path(__file__).resolve().parent
 sys.path += [str(FOLDER.parent), str(FOLDER.parent / "performance"), str(FOLDER)]
 from common import make_parser, note, print_table, recording
 from dense_log import gaps_m, largest, positions, repeated_survey
-from gap_fixes import drive
+from gap_fixes import CASES, drive
 
 from sonar_graph.evaluation import judge, run_estimator
 from sonar_graph.logs.convert import read_mrclam
@@ -141,7 +141,7 @@ def gaps(seeds: int) -> None:
         squares_m2 = []
         nees = []
         for seed in range(seeds):
-            sequence = drive(seed, has_fixes_in_gap=True)
+            sequence = drive(seed, CASES["fixes"])
             run = run_estimator(sequence, "isam2", rate_hz=RATE_HZ)
             scores = judge(sequence, sequence.instants(RATE_HZ), [run]).scores["isam2"]
             squares_m2.append(scores["causal.ate_raw_m"].value ** 2)

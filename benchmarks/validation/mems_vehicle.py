@@ -39,6 +39,8 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.evaluation import compare
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.models import gyro_bias_of
+from sonar_graph.numerics import vec
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.states import Trajectory
@@ -168,9 +170,17 @@ def run_seed(
 ) -> dict[str, Run]:
     """All estimators on one survey."""
     if has_one_bias:
-        nowhere: Any = lambda *_: np.zeros(3)  # noqa: E731
         start: Any = invariant_ekf.start_state
-        Keyframes._up = nowhere
+        linearised: Any = Keyframes._linearisation
+
+        def with_one_bias(self: Keyframes, i: int) -> Any:
+            linearisation = linearised(self, i)
+            nowhere = np.zeros(3)
+            gyro_bias = np.array(gyro_bias_of(linearisation.biases, vec(nowhere)))
+            return linearisation._replace(up=nowhere, gyro_bias=gyro_bias)
+
+        replaced: Any = Keyframes
+        replaced._linearisation = with_one_bias
         invariant_ekf.start_state = lambda calibration: start(calibration)._replace(
             is_level=False
         )

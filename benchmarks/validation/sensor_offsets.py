@@ -156,7 +156,7 @@ def one(case: str, seed: int) -> list[Held]:
     other = match_reference_to_imu(biased, shifted, calibration).offset
     estimates = (
         found.offset,
-        found.yaw,
+        found.turn[2],
         found.scale,
         other,
         *found.lever,
