@@ -123,6 +123,7 @@ from sonar_graph.navigation.alignment import (
     match_reference_to_imu,
     noise_densities,
 )
+from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
@@ -161,6 +162,8 @@ LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 LEAST_SHARE_OF_DELAY = 0.5
 """Share of a late IMU's delay that sightings and fixes show at least."""
+MOST_OUTLIERS = 0.1
+"""Share of velocities up to which those that no vehicle reaches are single wrong rows."""
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 BACKWARDS = -np.eye(3)
@@ -185,16 +188,28 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     """
     # matrices are small: threads of BLAS would only wait for each other
     with threadpool_limits(1, user_api="blas"):
-        findings = all_findings(of_whole_velocities(sequence), config or LogConfig())
+        findings = all_findings(of_usable_velocities(sequence), config or LogConfig())
     return worst_first([*unplaced_findings(sequence, findings), *findings])
 
 
-def of_whole_velocities(sequence: Sequence) -> Sequence:
-    """The sequence without the rows of the Doppler log that estimators refuse: some beams measured nothing."""
-    is_partial_row = is_partial(sequence.dvl.velocity_cov)
-    if not is_partial_row.any() or is_partial_row.all():
+def of_usable_velocities(sequence: Sequence) -> Sequence:
+    """The sequence without the rows of the Doppler log that estimators refuse: of too few beams, or outliers.
+
+    Where they would refuse many, the log as a whole may have another unit or another noise, which is to be found.
+    """
+    dvl = sequence.dvl
+    is_used = ~is_partial(dvl.velocity_cov)
+    if not is_used.any():
         return sequence
-    return replace(sequence, dvl=sequence.dvl.rows(np.flatnonzero(~is_partial_row)))
+    intake = RowIntake(sequence.calibration)
+    intake.add_dvl(dvl)
+    refused_ns = [row.stamp_ns for row in intake.refused]
+    is_accepted = is_used & ~np.isin(dvl.stamps_ns, refused_ns)
+    if is_accepted.sum() >= (1.0 - MOST_OUTLIERS) * is_used.sum():
+        is_used = is_accepted
+    if is_used.all():
+        return sequence
+    return replace(sequence, dvl=dvl.rows(np.flatnonzero(is_used)))
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
