@@ -73,6 +73,8 @@ class World:
     is_start_stated: bool
     gaps_s: tuple[tuple[float, float], ...]
     """Without bottom lock."""
+    wild_share: float
+    """Of the rows of Doppler log, depth, heading and fixes, which are far off, as right sensors have them at times."""
 
     @classmethod
     def draw(cls, rng: np.random.Generator, needs: frozenset[str]) -> "World":
@@ -111,6 +113,7 @@ class World:
             has_yaw_message=bool(rng.random() < 0.5),
             is_start_stated=not (is_measured and rng.random() < 0.4),
             gaps_s=tuple(gaps_s),
+            wild_share=float(rng.choice([0.0, 0.01])),
         )
 
 
@@ -253,6 +256,15 @@ def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
         [gauss_markov(rng, fix_s, 0.15 * noise, 10.0) for _ in range(3)]
     )
     fix_m = fix_m + wander + rng.normal(0, 0.3 * noise, (len(fix_s), 3))
+
+    for values, size in (
+        (velocity, 3.0),
+        (z_m, 5.0),
+        (yaw_rad, 2.0),
+        (fix_m, 20.0),
+    ):
+        is_wild = rng.random(len(values)) < world.wild_share
+        values[is_wild] += rng.uniform(-size, size, values[is_wild].shape)
 
     yaw_0, pitch_0, roll_0 = attitude(0.0).as_euler("ZYX")
     return Log(

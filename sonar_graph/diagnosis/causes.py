@@ -34,6 +34,7 @@ from sonar_graph.diagnosis.signals import (
 )
 from sonar_graph.diagnosis.start import turned_mounting
 from sonar_graph.diagnosis.turn_rate import residual
+from sonar_graph.measurements import Floats
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.numerics import running_integral
 from sonar_graph.sequence import Sequence
@@ -87,13 +88,13 @@ def of_way(stretch: SignalStretch) -> Values:
 
 def of_turn(stretch: SignalStretch) -> Values:
     """Direction of the heading, and a drift of the gyros, shape (n, 3)."""
-    yaw_rad = stretch.y.real
+    yaw_rad = stretch.x.real
     return np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), since_middle(stretch)])
 
 
 def of_turn_and_twice(stretch: SignalStretch) -> Values:
     """Directions of the heading and of twice the heading, and a drift of the gyros, shape (n, 5)."""
-    twice_rad = 2.0 * stretch.y.real
+    twice_rad = 2.0 * stretch.x.real
     soft = np.column_stack([np.cos(twice_rad), np.sin(twice_rad)])
     return np.hstack([soft, of_turn(stretch)])
 
@@ -253,7 +254,7 @@ def explained_by(cause: Cause, found: Match) -> Explained | None:
     shown = [
         stretch
         for stretch in found.stretches
-        if np.ptp(stretch.y.real) >= cause.least_turn_rad
+        if np.ptp(stretch.x.real) >= cause.least_turn_rad
     ]
     return explained(shown, cause.columns, cause.wanted)
 
@@ -306,7 +307,7 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
 
 EXCURSION_OVER_S = 5.0
 """Time over which noise and waves average out of a heading."""
-FEWEST_MEANS = 12
+FEWEST_MEDIANS = 12
 MOST_PAIRS = 20_000
 EXCURSION_SCATTERS = 8.0
 MOST_OFF = 0.4
@@ -316,8 +317,8 @@ MOST_OFF = 0.4
 def excursion(found: Match, least: float) -> str:
     """Size and time of a stretch in which a sensor leaves its reference and comes back; empty without one.
 
-    The means over some seconds of what it has beyond the reference are on a line, by the median of the slopes (Theil,
-    Sen), but for a share of them.
+    The medians over some seconds of what it has beyond the reference are on a line, by the median of the slopes (Theil,
+    Sen), but for a share of them. A single wild row does not move them.
     """
     for whole in found.whole:
         beyond = whole.excess()
@@ -327,16 +328,15 @@ def excursion(found: Match, least: float) -> str:
             continue
         block = ((t - t[0]) // EXCURSION_OVER_S).astype(int)
         _, first = np.unique(block, return_index=True)
-        count = np.diff([*first, len(t)])
-        middle_s = np.add.reduceat(t, first) / count
-        mean = np.add.reduceat(beyond.y.real[is_known], first) / count
-        if len(mean) < FEWEST_MEANS:
+        middle_s = medians(np.split(t, first[1:]))
+        usual = medians(np.split(beyond.y.real[is_known], first[1:]))
+        if len(usual) < FEWEST_MEDIANS:
             continue
-        i, j = np.triu_indices(len(mean), 1)
+        i, j = np.triu_indices(len(usual), 1)
         every = max(1, len(i) // MOST_PAIRS)
-        rise = mean[j[::every]] - mean[i[::every]]
+        rise = usual[j[::every]] - usual[i[::every]]
         slope = np.median(rise / (middle_s[j[::every]] - middle_s[i[::every]]))
-        off = mean - slope * middle_s
+        off = usual - slope * middle_s
         off -= np.median(off)
         scatter = 1.4826 * float(np.median(np.abs(off)))
         is_off = np.abs(off) > max(least, EXCURSION_SCATTERS * scatter)
@@ -347,6 +347,11 @@ def excursion(found: Match, least: float) -> str:
                 f"by up to {largest_deg:.2g}° between {begin_s:.0f} and {end_s:.0f} s"
             )
     return ""
+
+
+def medians(blocks: list[Floats]) -> Floats:
+    """Of each block of numbers."""
+    return np.array([np.median(block) for block in blocks])
 
 
 def velocity_steps(sequence: Sequence) -> Finding | None:

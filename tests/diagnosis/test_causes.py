@@ -255,6 +255,26 @@ def test_right_sensors_have_no_cause():
     assert not acting(observed())
 
 
+@pytest.mark.parametrize(
+    ("sensor", "column", "size"),
+    [
+        ("dvl", "velocity", 3.0),
+        ("depth", "z_m", 5.0),
+        ("heading", "yaw_rad", 2.0),
+        ("positions", "position_m", 20.0),
+    ],
+)
+def test_single_wild_rows_of_right_sensors_have_no_cause(sensor, column, size):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        run = observed()
+        values = getattr(getattr(run, sensor), column).copy()
+        is_wild = rng.random(len(values)) < 0.02
+        signs = rng.choice([-1.0, 1.0], values[is_wild].shape)
+        values[is_wild] += size * signs
+        assert not acting(spoilt(run, sensor, **{column: values}))
+
+
 SCALED = {
     "heading": "use = false` under [heading]",
     "gyros": "angular_velocity_scale = 1.12",
