@@ -536,6 +536,8 @@ def robots(folder: Path, case: tuple[int, int]) -> dict[str, Figures]:
     found = {}
     for name in ESTIMATORS:
         found[name] = in_map(name, unsure, known)
+        # how far the recording's own noise is from the stated one
+        found[name]["own_nees"] = float(run(name, second, None).nees.mean())
         located = run(name, lost(second), known)
         found[name]["lost_m"] = located.rms_m
         waited_ns = located.stamps_ns[0] - second.start_ns
@@ -576,13 +578,17 @@ def ratio_of(rows: list[Figures], above: str, below: str) -> float:
     return float(np.sqrt(squares[0] / squares[1]))
 
 
+WIDEST = 0.5
+"""Half of the 95 % interval of a mean NEES, up to which it says something."""
+
+
 def nees_claim(what: str, rows: list[Figures], key: str) -> Claim:
     values = np.array([one[key] for one in rows])
     mean = float(values.mean())
     half = float(1.96 * values.std(ddof=1) / np.sqrt(len(values)))
-    return Claim(
-        what, f"{mean:.2f} ± {half:.2f}", "holds 1", mean - half <= 1.0 <= mean + half
-    )
+    # a wide interval holds anything
+    is_met = abs(mean - 1.0) <= half <= WIDEST
+    return Claim(what, f"{mean:.2f} ± {half:.2f}", f"1, known to {WIDEST:g}", is_met)
 
 
 def dive_claims(place: str, found: list[dict[str, Figures]]) -> list[Claim]:
@@ -591,21 +597,26 @@ def dive_claims(place: str, found: list[dict[str, Figures]]) -> list[Claim]:
     for name in ESTIMATORS:
         rows = [one[name] for one in found]
         head = f"{place}, {name}"
-        for key, label in (("with_m", "refined"), ("held_m", "held")):
-            ratio = ratio_of(rows, key, "without_m")
-            claims.append(
-                Claim(
-                    f"{head}, {label} map: error over that without it",
-                    f"{ratio:.2f}",
-                    f"at most {MOST_RATIO}",
-                    ratio <= MOST_RATIO,
-                )
-            )
+        refined = ratio_of(rows, "with_m", "without_m")
+        held = ratio_of(rows, "held_m", "without_m")
         claims += [
-            nees_claim(f"{head}, NEES of position, refined map", rows, "nees"),
+            Claim(
+                f"{head}: error over that without the map; the same, held",
+                f"{refined:.2f}; {held:.2f}",
+                f"at most {MOST_RATIO}",
+                max(refined, held) <= MOST_RATIO,
+            ),
+            nees_claim(f"{head}, NEES of position", rows, "nees"),
             nees_claim(f"{head}, NEES of position, held map", rows, "held_nees"),
             nees_claim(f"{head}, NEES of the refined map", rows, "map_nees"),
         ]
+        if "own_nees" in rows[0]:
+            own = nees_claim(
+                f"{head}, NEES of position without a map, from the true start",
+                rows,
+                "own_nees",
+            )
+            claims.append(own._replace(target="", is_met=True))
         if "moved_m" in rows[0]:
             ratio = ratio_of(rows, "moved_m", "rest_m")
             named = sum(one["named"] for one in rows)
