@@ -41,10 +41,18 @@ test-thorough: $(VENV)/.installed-tests
 	$(BIN)/python tests/compile_kernels.py
 	$(BIN)/python -m pytest -n auto --hypothesis-profile=thorough
 
+# Scripts are no library, and most are not run by the tests: of them only names and arguments are checked.
+SCRIPTS = $(BIN)/mypy --config-file= --check-untyped-defs --ignore-missing-imports --explicit-package-bases \
+	$(addprefix --disable-error-code=,arg-type assignment call-overload func-returns-value index misc operator \
+	return-value type-var union-attr var-annotated)
+SCRIPT_PATH = benchmarks:benchmarks/performance:benchmarks/validation:benchmarks/published_rules:benchmarks/actag_plugin
+
 check: $(VENV)/.installed-lint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	MYPYPATH=$(SCRIPT_PATH) $(SCRIPTS) benchmarks/validation
+	MYPYPATH=$(SCRIPT_PATH) $(SCRIPTS) benchmarks/performance
 	$(BIN)/lint-imports
 
 # A warning ends it: a dead link, a page that is in no menu, a tutorial or a docstring that fails.

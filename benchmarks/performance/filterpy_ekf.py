@@ -268,13 +268,15 @@ class _Feed:
     def gravity(self, reached_ns: int) -> None:
         calibration = self.slam.calibration
         stamps_ns = np.array([self.opened_ns, self.node_ns])
-        ends, variances = zip(
+        (velocity_i, velocity_j), variances = zip(
             *(self.odometry.velocity_at_imu(int(t)) for t in stamps_ns), strict=True
         )
         (motion,) = self.motions(stamps_ns, reached_ns)
         sigma_m_s = math.sqrt(0.5 * sum(variances))
         self.opened_ns = self.node_ns
-        found = gravity_direction(motion, *ends, sigma_m_s, calibration)
+        found = gravity_direction(
+            motion, velocity_i, velocity_j, sigma_m_s, calibration
+        )
         if found is None:
             return
         up, sigma = found

@@ -260,15 +260,15 @@ def main() -> None:
             )
             for one in run
         ]
-    rows = kernel_rows(found)
+    kernels = kernel_rows(found)
     print_table(
-        tuple(rows[0]),
+        tuple(kernels[0]),
         [
             tuple("-" if value is None else value for value in row.values())
-            for row in rows
+            for row in kernels
         ],
     )
-    conclude({"rows": rows, "passed": True}, is_quick=arguments.quick)
+    conclude({"rows": kernels, "passed": True}, is_quick=arguments.quick)
 
 
 if __name__ == "__main__":

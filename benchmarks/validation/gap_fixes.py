@@ -14,7 +14,7 @@ interval of every judged estimator holds 1 or lies below it, and no seed's NEES 
 
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -226,7 +226,7 @@ def main() -> None:
     passed = True
     for label in CASES:
         for name in ESTIMATORS:
-            of_runs = Scores(*np.array([one[name, label] for one in found]).T)
+            of_runs: Any = Scores(*np.array([one[name, label] for one in found]).T)
             nees = float(of_runs.nees_after.mean())
             half = 1.96 * float(of_runs.nees_after.std(ddof=1) / np.sqrt(runs))
             worst = float(of_runs.nees_after.max())

@@ -331,9 +331,12 @@ def run(
         squared = pose @ np.linalg.solve(P, pose)
         rows.append((*e[:2], nees, np.linalg.norm(turn), squared))
     columns = np.array(rows)
+    nees, turn_rad, pose_squared = columns[:, 2:].T
     return Run(
         columns[:, :2],
-        *columns[:, 2:].T,
+        nees,
+        turn_rad,
+        pose_squared,
         stamps_ns,
         withheld_of(estimator),
         known_map_of(estimator),

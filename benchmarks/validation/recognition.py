@@ -258,7 +258,11 @@ def _watched(
             nis.append(normalised(found, hits[len(hits) // 2]))
             mean_nis.append(normalised_mean(found, hits))
     return Watched(
-        *map(np.array, (recognised, fooled, delay_s, nis, mean_nis)),
+        np.array(recognised),
+        np.array(fooled),
+        np.array(delay_s),
+        np.array(nis),
+        np.array(mean_nis),
         np.array(middle, dtype=int),
     )
 

@@ -246,8 +246,8 @@ def outcome(path: Path) -> Outcome:
             )
     except SonarGraphError as error:
         return Outcome(str(error), {}, {}, {}, str(error))
-    console = Console(file=StringIO(), width=10_000)
-    console.print(summary(comparison))
+    told = StringIO()
+    Console(file=told, width=10_000).print(summary(comparison))
     errors, seconds, failed = {}, {}, {}
     for run in comparison.runs:
         scores = comparison.scores[run.estimator]
@@ -257,7 +257,7 @@ def outcome(path: Path) -> Outcome:
         seconds[run.estimator] = float(run.update_s.sum() + run.finish_s)
         if run.status == "failed":
             failed[run.estimator] = run.reason
-    return Outcome("", failed, errors, seconds, console.file.getvalue())
+    return Outcome("", failed, errors, seconds, told.getvalue())
 
 
 def hung(*_: object) -> None:
