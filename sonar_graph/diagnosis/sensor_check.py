@@ -193,23 +193,28 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
 
 
 def of_usable_velocities(sequence: Sequence) -> Sequence:
-    """The sequence without the rows of the Doppler log that estimators refuse: of too few beams, or outliers.
+    """The sequence without what estimators refuse of the Doppler log: rows of too few beams, and outliers.
 
-    Where they would refuse many, the log as a whole may have another unit or another noise, which is to be found.
+    An outlier gets the velocity between its neighbours, since the gyros' turn is taken at its stamp too. Where many rows
+    are refused, the log as a whole may have another unit or another noise, which is to be found.
     """
-    dvl = sequence.dvl
-    is_used = ~is_partial(dvl.velocity_cov)
-    if not is_used.any():
+    whole = ~is_partial(sequence.dvl.velocity_cov)
+    if not whole.any():
         return sequence
+    dvl = sequence.dvl if whole.all() else sequence.dvl.rows(np.flatnonzero(whole))
     intake = RowIntake(sequence.calibration)
     intake.add_dvl(dvl)
     refused_ns = [row.stamp_ns for row in intake.refused]
-    is_accepted = is_used & ~np.isin(dvl.stamps_ns, refused_ns)
-    if is_accepted.sum() >= (1.0 - MOST_OUTLIERS) * is_used.sum():
-        is_used = is_accepted
-    if is_used.all():
-        return sequence
-    return replace(sequence, dvl=dvl.rows(np.flatnonzero(is_used)))
+    is_outlier = np.isin(dvl.stamps_ns, refused_ns)
+    if 0.0 < is_outlier.mean() <= MOST_OUTLIERS:
+        usual_ns = dvl.stamps_ns[~is_outlier]
+        velocity = dvl.velocity.copy()
+        for axis in velocity.T:
+            axis[is_outlier] = np.interp(
+                dvl.stamps_ns[is_outlier], usual_ns, axis[~is_outlier]
+            )
+        dvl = replace(dvl, velocity=velocity)
+    return replace(sequence, dvl=dvl)
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
