@@ -12,7 +12,7 @@ log: rows are numbered by the part without one that they belong to, and referenc
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +46,32 @@ class FeltMotion:
     """``mean(C f) - d(C v)/dt``."""
     impulse_m_s: Floats
     """``int C f dt``."""
+    windows: "Windows"
+    """Over which the derivatives are taken."""
+
+
+class Windows(NamedTuple):
+    """A time about each row of the Doppler log, at least to its neighbours: the velocity is known best at rows."""
+
+    begin_s: Floats
+    end_s: Floats
+
+    @classmethod
+    def about(cls, t: Floats, parts: Ints) -> "Windows":
+        """Windows of `UP_OVER_S` about times t, or longer, which end where a part does, shape (n,)."""
+        first = t[np.searchsorted(parts, parts)]
+        last = t[np.searchsorted(parts, parts, side="right") - 1]
+        before = np.append(t[0], t[:-1])
+        after = np.append(t[1:], t[-1])
+        begin_s = np.minimum(t - UP_OVER_S / 2, before)
+        end_s = np.maximum(t + UP_OVER_S / 2, after)
+        return cls(np.maximum(begin_s, first), np.minimum(end_s, last))
+
+    def rates(self, at: Callable[[Floats], Floats]) -> Floats:
+        """Mean rates of change of a quantity, shape (n, 3); NaN for a row that is a part of its own."""
+        duration_s = self.end_s - self.begin_s
+        duration_s = np.where(duration_s > 0.0, duration_s, np.nan)
+        return np.asarray((at(self.end_s) - at(self.begin_s)) / duration_s[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +124,11 @@ class BodyMotion:
         )
         # the one place where integrals break: every reference and stretch goes by these parts
         breaks = (intervals > longest_s) | (np.diff(path.parts_at(t)) > 0)
+        parts = np.concatenate([[0], np.cumsum(breaks)])
+        windows = Windows.about(t, parts)
         C = path.rotations_at(t)  # (n, 3, 3)
         velocity = np.einsum("nij,nj->ni", C, v)
-        gravity = felt_gravity(path, t, velocity, calibration)
+        gravity = felt_gravity(path, t, velocity, windows, calibration)
         up_in_path = C[:, :, 2]
         felt = None
         if gravity is not None:
@@ -108,7 +136,7 @@ class BodyMotion:
             up_in_path = gravity / size[:, None]
             rate_in_path = np.einsum("nij,nj->ni", C, rate)
             impulse = path.linear_at(t, path.impulse)
-            felt = FeltMotion(velocity, rate_in_path, gravity, impulse)
+            felt = FeltMotion(velocity, rate_in_path, gravity, impulse, windows)
         up = np.einsum("nji,nj->ni", C, up_in_path)
         is_held = calibration.odometry_interpolation == "hold-past"
         # at the IMU's rate, since turns are faster than rows of the Doppler log
@@ -123,7 +151,7 @@ class BodyMotion:
         return cls(
             origin_ns=path.origin_ns,
             seconds=t,
-            parts=np.concatenate([[0], np.cumsum(breaks)]),
+            parts=parts,
             up=up,
             yaw_rad=np.asarray(yaw_rad, np.float64),
             height_m=running_integral(t, np.sum(v * up, axis=1), is_held=is_held),
@@ -224,32 +252,17 @@ def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
 
 
 def felt_gravity(
-    path: InertialPath, t: Floats, v: Floats, calibration: Calibration
+    path: InertialPath,
+    t: Floats,
+    v: Floats,
+    windows: Windows,
+    calibration: Calibration,
 ) -> Floats | None:
     """Gravity in the frame of the path at times t, shape (n, 3), upwards; v is C v. None without it in the forces."""
     if not (np.isfinite(path.impulse).all() and calibration.use_gravity):
         return None
-    # a window that goes over a hole of the IMU would hold what was not measured
-    begin = np.maximum(t - UP_OVER_S / 2, part_edges(path, t, "left"))
-    end = np.minimum(t + UP_OVER_S / 2, part_edges(path, t, "right"))
-    gained = path.linear_at(end, path.impulse) - path.linear_at(begin, path.impulse)
+    force = windows.rates(lambda at: path.linear_at(at, path.impulse))
     # what moves the vehicle is no gravity
-    accelerated = np.gradient(smoothed(t, v), t, axis=0)
-    return np.asarray(gained / np.maximum(end - begin, 1e-9)[:, None] - accelerated)
-
-
-def part_edges(path: InertialPath, t: Floats, side: Literal["left", "right"]) -> Floats:
-    """First (left) or last time of the part of the path that each instant is in, shape (n,)."""
-    rows = np.searchsorted(path.parts, path.parts_at(t), side=side)
-    return path.seconds[rows - (side == "right")]
-
-
-def smoothed(t: Floats, values: Floats) -> Floats:
-    """Columns averaged over `UP_OVER_S`, or as they are where rows are farther apart."""
-    if np.median(np.diff(t)) >= UP_OVER_S / 2:
-        return values
-    total = running_integral(t, values)
-    begin = np.maximum(t - UP_OVER_S / 2, t[0])
-    end = np.minimum(t + UP_OVER_S / 2, t[-1])
-    gained = columns_at(end, t, total) - columns_at(begin, t, total)
-    return np.asarray(gained / np.maximum(end - begin, 1e-9)[:, None])
+    accelerated = windows.rates(lambda at: columns_at(at, t, v))
+    gravity = force - accelerated
+    return filled(gravity) if np.isfinite(gravity).any() else None

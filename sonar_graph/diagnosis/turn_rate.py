@@ -22,11 +22,7 @@ from sonar_graph.diagnosis.findings import (
     matters,
     scale_line,
 )
-from sonar_graph.diagnosis.motion_signals import (
-    UP_OVER_S,
-    BodyMotion,
-    smoothed,
-)
+from sonar_graph.diagnosis.motion_signals import UP_OVER_S, BodyMotion
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
     Match,
@@ -35,7 +31,7 @@ from sonar_graph.diagnosis.signals import (
 )
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import NS_PER_S, Floats
-from sonar_graph.numerics import running_integral
+from sonar_graph.numerics import columns_at, running_integral
 from sonar_graph.sequence import Sequence
 
 GRAVITY_OVER_S = 30.0
@@ -94,10 +90,11 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
         return None
     noise = max(root_mean_square([np.sum(r * along, axis=1)]), 1e-12)
     excess = root_mean_square([np.sum(r * across, axis=1)]) / noise
-    # averaged as the forces are
+    # over the windows of the forces
     turned = running_integral(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
-    by_rate = np.gradient(smoothed(t, turned), t, axis=0)
-    by_velocity = np.gradient(smoothed(t, felt.velocity_m_s), t, axis=0) - by_rate
+    by_rate = felt.windows.rates(lambda at: columns_at(at, t, turned))
+    changed = felt.windows.rates(lambda at: columns_at(at, t, felt.velocity_m_s))
+    by_velocity = changed - by_rate
     found = gain_along(motion, by_rate, r, across)
     of_scale = gain_along(motion, by_velocity, r, along).gain
     of_scale = of_scale.limited(LARGEST_SCALE_SIGMA, "even speed")
