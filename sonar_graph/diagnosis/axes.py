@@ -39,6 +39,8 @@ LEAST_GAIN = 60.0
 """Least drop of chi-square, by the noise that the best candidate leaves; 48 candidates come by chance to some 15."""
 LEAST_RATIO = 1.3
 """Least ratio of the sums of squares as they are and at the best candidate."""
+LEAST_SECOND = 0.3
+"""Second singular value of the matrix of velocities over its first, from which on they have two directions."""
 OTHER_UNIT = 1.3
 """Scale, either way, from which on a unit is suspected."""
 MOST_MISFIT = 0.05
@@ -94,7 +96,7 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     for k, G in enumerate(candidates):
         Q = rows.quadratic_form(G)
         squares[k] = np.einsum("ki,ij,kj->k", entries, Q, entries)
-        least[k] = least_of(Q)
+        least[k], _ = least_of(Q)
     if squares[0, 0] > LEAST_RATIO * squares.min():
         with_force_axes(rows, candidates, squares, least)
     best = squares.min()
@@ -137,7 +139,7 @@ def with_force_axes(
         for j, P in enumerate(candidates):
             if is_of_force(candidates[k], P):
                 squares[k, j] = square_of(Q, P)
-                least[k, j] = least_of(Q)
+                least[k, j], _ = least_of(Q)
 
 
 def is_of_force(gyro: Floats, dvl: Floats) -> bool:
@@ -154,7 +156,7 @@ def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
     if rows.freedom < LEAST_FREEDOM:
         return AxesMatch()
     Q = rows.quadratic_form(np.eye(3))
-    least = least_of(Q)
+    least, _ = least_of(Q)
     as_read = square_of(Q, np.eye(3))
     most = MOST_LEFT * least
     # late rows fit badly in any axes
@@ -212,18 +214,22 @@ def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float 
     rows = SharedRows.of(imu, dvl, calibration)
     if rows is None:
         return None
-    of_body = least_of(rows.quadratic_form(np.eye(3)))
-    of_world = least_of(rows.quadratic_form(np.eye(3), is_in_world=True))
+    of_body, _ = least_of(rows.quadratic_form(np.eye(3)))
+    of_world, matrix = least_of(rows.quadratic_form(np.eye(3), is_in_world=True))
     gain = (of_body - of_world) * rows.freedom / of_world
-    if of_body > LEAST_RATIO * of_world and gain > LEAST_GAIN:
+    # of a way straight up and down the level velocities are noise, which a matrix of one direction leaves out
+    first, second, _ = np.linalg.svd(matrix, compute_uv=False)
+    has_level_way = second > LEAST_SECOND * first
+    if of_body > LEAST_RATIO * of_world and gain > LEAST_GAIN and has_level_way:
         return float(np.sqrt(of_body / of_world))
     return None
 
 
-def least_of(Q: Floats) -> float:
-    """The least of a quadratic form of `SharedRows` that any matrix leaves."""
+def least_of(Q: Floats) -> tuple[float, Floats]:
+    """The least of a quadratic form of `SharedRows`, and the matrix that leaves it, shape (3, 3)."""
     free = np.linalg.lstsq(Q[1:, 1:], -Q[1:, 0])[0]
-    return float(max(Q[0, 0] + free @ Q[1:, 0], 1e-12))
+    least = float(max(Q[0, 0] + free @ Q[1:, 0], 1e-12))
+    return least, np.asarray(free.reshape(3, 3), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
