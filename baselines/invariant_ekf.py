@@ -408,9 +408,10 @@ class InvariantEkf(FilterShell):
 
     def by_point(self, G: Floats) -> Floats:
         """Derivative of xi_new, (6), by xi: of theta nothing, since Exp(theta) turns all points, and all of xi_0."""
-        G[:, THETA] = 0.0
-        G[:, BODY] = np.eye(3)
-        return G
+        by_state = G.copy()
+        by_state[:, THETA] = 0.0
+        by_state[:, BODY] = np.eye(3)
+        return by_state
 
     def covariance(self) -> Floats:
         """P of xi."""

@@ -83,17 +83,22 @@ class Estimator(Protocol):
         ...
 
 
-# Optional parts of the contract: methods of these names without arguments, which an estimator may have.
+def optional_method(estimator: Estimator, name: str) -> Callable[[], Any] | None:
+    """An optional part of the contract: a method without arguments; None where it is missing, or set to None."""
+    found: Callable[[], Any] | None = getattr(estimator, name, None)
+    return found
 
 
 def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
     """Rows of IMU, Doppler log and depth that an estimator names as not used: its ``refused_rows``; or none."""
-    return list(getattr(estimator, "refused_rows", list)())
+    refused_rows = optional_method(estimator, "refused_rows")
+    return list(refused_rows()) if refused_rows else []
 
 
 def withheld_of(estimator: Estimator) -> list[str]:
     """Messages, a line each, about measurements that an estimator could not use or contradicts: its ``withheld``."""
-    return list(getattr(estimator, "withheld", list)())
+    withheld = optional_method(estimator, "withheld")
+    return list(withheld()) if withheld else []
 
 
 def newest_landmarks_of(estimator: Estimator) -> LandmarkMap:
@@ -101,7 +106,8 @@ def newest_landmarks_of(estimator: Estimator) -> LandmarkMap:
 
     For an estimator whose `Estimator.landmarks` takes longer the longer a run is.
     """
-    found: LandmarkMap = getattr(estimator, "newest_landmarks", estimator.landmarks)()
+    newest_landmarks = optional_method(estimator, "newest_landmarks")
+    found: LandmarkMap = (newest_landmarks or estimator.landmarks)()
     return found
 
 
@@ -110,13 +116,14 @@ def known_map_of(estimator: Estimator) -> KnownMap:
 
     An `EstimatorError` where an estimator has no landmark, or does not give its map.
     """
-    if not hasattr(estimator, "known_map"):
+    known_map = optional_method(estimator, "known_map")
+    if known_map is None:
         raise EstimatorError(
             f"{type(estimator).__name__} has no known_map(): it cannot save a map; isam2 and both filters can"
         )
     if not len(estimator.landmarks()):
         raise EstimatorError("no landmark was seen: there is no map to save")
-    found: KnownMap = estimator.known_map()
+    found: KnownMap = known_map()
     return found
 
 

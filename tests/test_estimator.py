@@ -15,8 +15,10 @@ from sonar_graph.errors import (
 )
 from sonar_graph.estimator import (
     installed_estimators,
+    known_map_of,
     load_estimator,
     make_params,
+    newest_landmarks_of,
 )
 from sonar_graph.evaluation import (
     compare,
@@ -42,6 +44,15 @@ class Nothing:
 class OnlyTrajectory:
     Params: ClassVar[type[Section]] = Section
     trajectory = None
+
+
+class Bare(DeadReckoning):
+    """Without the optional parts of the contract, which its base may have."""
+
+    refused_rows = None
+    withheld = None
+    newest_landmarks = None
+    known_map = None
 
 
 def announce(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
@@ -75,6 +86,17 @@ def test_third_party_is_found_by_its_name_without_being_imported(monkeypatch):
         match=r"broken \(no_such_package:X\) cannot be loaded: .*no_such_package",
     ):
         load_estimator("broken")
+
+
+def test_optional_methods_set_to_none_count_as_missing():
+    run = run_estimator(small_world(), Bare)
+    assert run.status == "ok"
+    assert run.refused == []
+    world = small_world()
+    bare = Bare(world.calibration, Odometry(world.calibration))
+    assert len(newest_landmarks_of(bare)) == 0
+    with pytest.raises(EstimatorError, match=r"Bare has no known_map\(\)"):
+        known_map_of(bare)
 
 
 def test_missing_methods_are_named(monkeypatch):

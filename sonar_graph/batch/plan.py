@@ -348,6 +348,8 @@ def versions_of(estimator: str) -> dict[str, str]:
         raise BatchError(
             f"{platform.node()}: no estimator is called {estimator!r}; install what brings it"
         )
+    # a target that is no name of Python is refused where the estimator is loaded
+    module = point.value.partition(":")[0]
     brings = {} if point.dist is None else {point.dist.name: point.dist.version}
     return brings | {
         "sonar_graph": __version__,
@@ -355,7 +357,7 @@ def versions_of(estimator: str) -> dict[str, str]:
         "python": platform.python_version(),
         "estimator_target": point.value,
         "source": source_hash("sonar_graph"),
-        "estimator_source": source_hash(point.module.partition(".")[0]),
+        "estimator_source": source_hash(module.partition(".")[0]),
     }
 
 

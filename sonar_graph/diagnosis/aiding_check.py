@@ -767,6 +767,8 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     if depth is None or fixes is None:
         return
     has_height = fixes.are_sound() & ~are_unmeasured(fixes)[:, 2]
+    if not has_height.any():
+        return
     fixes = fixes.rows(np.flatnonzero(has_height))
     by_depth = np.interp(
         fixes.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan

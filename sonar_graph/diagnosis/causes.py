@@ -254,9 +254,15 @@ def explained_by(cause: Cause, found: Match) -> Explained | None:
     shown = [
         stretch
         for stretch in found.stretches
-        if np.ptp(stretch.x.real) >= cause.least_turn_rad
+        if known_range(stretch.x) >= cause.least_turn_rad
     ]
     return explained(shown, cause.columns, cause.wanted)
+
+
+def known_range(values: Values) -> float:
+    """Largest less smallest value; references are unknown across gaps."""
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known.real)) if len(known) else 0.0
 
 
 def cause_of(

@@ -125,6 +125,7 @@ from sonar_graph.navigation.alignment import (
 )
 from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.sequence import Sequence
+from sonar_graph.states import Refusal
 
 YAW = "DVL mounting yaw"
 LEVEL_TURNS = ("DVL mounting roll", "DVL mounting pitch")
@@ -188,7 +189,8 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
     """
     # matrices are small: threads of BLAS would only wait for each other
     with threadpool_limits(1, user_api="blas"):
-        findings = all_findings(of_usable_velocities(sequence), config or LogConfig())
+        usable = of_usable_velocities(without_stuck(sequence))
+        findings = all_findings(usable, config or LogConfig())
     return worst_first([*unplaced_findings(sequence, findings), *findings])
 
 
@@ -204,8 +206,10 @@ def of_usable_velocities(sequence: Sequence) -> Sequence:
     dvl = sequence.dvl if whole.all() else sequence.dvl.rows(np.flatnonzero(whole))
     intake = RowIntake(sequence.calibration)
     intake.add_dvl(dvl)
-    refused_ns = [row.stamp_ns for row in intake.refused]
-    is_outlier = np.isin(dvl.stamps_ns, refused_ns)
+    outlier_ns = [
+        row.stamp_ns for row in intake.refused if row.reason is Refusal.OUTLIER
+    ]
+    is_outlier = np.isin(dvl.stamps_ns, outlier_ns)
     if 0.0 < is_outlier.mean() <= MOST_OUTLIERS:
         usual_ns = dvl.stamps_ns[~is_outlier]
         velocity = dvl.velocity.copy()
@@ -250,7 +254,6 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
     if faults := wrong_units(sequence, config):
         return faults
-    sequence = without_stuck(sequence)
     if lacks_gravity(sequence):
         # as if its owner had stated so
         update = {"use_gravity": False}

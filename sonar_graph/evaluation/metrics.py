@@ -183,6 +183,8 @@ def relative_errors(
     translation_m : norm of the translation of ``(true motion)⁻¹ (estimated motion)``, shape (k,)
     yaw_rad : estimated minus true change of heading, wrapped, shape (k,)
     """
+    # checks that both are at the same instants
+    yaw_error = yaw_errors_rad(estimate, truth)
     # overlapping pairs use every instant, not only each tenth second
     first, second = pairs_apart(estimate.stamps_ns, delta_s)
 
@@ -191,7 +193,6 @@ def relative_errors(
         return np.asarray(np.einsum("kji,kj->ki", trajectory.matrices[first], step))
 
     error_m = body_displacement(estimate) - body_displacement(truth)
-    yaw_error = yaw_errors_rad(estimate, truth)
     turned = wrap_angle(yaw_error[second] - yaw_error[first])
     return np.linalg.norm(error_m, axis=1), turned
 

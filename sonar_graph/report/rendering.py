@@ -6,6 +6,7 @@ Everything that comes from a suite, a log or an estimator is escaped.
 import base64
 import csv
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,9 +100,11 @@ def as_csv(table: Table) -> str:
         texts = [section] if table.sections else []
         for column, cell in zip(table.columns, row, strict=True):
             for value in cell.numbers:
-                # numpy's own text of a number has its type
-                text = repr(float(value)) if isinstance(value, float) else str(value)
-                texts.append("" if text == "nan" else text)
+                text = str(value)
+                if isinstance(value, float):
+                    # numpy's own text of a number has its type
+                    text = "" if math.isnan(value) else repr(float(value))
+                texts.append(text)
             texts += [""] * (len(column.parts) - len(cell.numbers))
         rows.append(texts)
     return csv_text(rows)

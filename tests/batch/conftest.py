@@ -63,7 +63,7 @@ def misbehaving(tmp_path, monkeypatch):
     (about / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: misbehaving\nVersion: 1.0\n"
     )
-    points = ["[sonar_graph.estimators]", "broken = not_there:Broken"]
+    points = ["[sonar_graph.estimators]", "broken = not-there.module:Broken"]
     code = ["import os, signal, time"]
     code += [
         "from pathlib import Path",

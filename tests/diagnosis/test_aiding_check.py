@@ -11,6 +11,7 @@ from sonar_graph.diagnosis import Finding, aiding_check, check_sensors
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.units import force_scale
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.measurements import UNMEASURED_M2
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -276,6 +277,23 @@ def test_a_turned_sonar_is_named_with_the_mounting_that_puts_it_right(turn_rad: 
         *_, yaw_rad = line_of(found[0])["sonar"]["mounting"]["rpy_rad"]
         before = SEEN.calibration.sonar.mounting.rpy_rad[2]
         assert yaw_rad == pytest.approx(before - turn_rad, abs=0.06)
+
+
+def test_a_gap_of_the_doppler_log_hides_no_turn_of_the_sonar():
+    """No reference is known across the gap, for a few of the pairs."""
+    azimuth_rad = SEEN.detections.azimuth_rad + 0.35
+    turned = spoilt(SEEN, "detections", azimuth_rad=azimuth_rad)
+    t = (turned.dvl.stamps_ns - turned.start_ns) * 1e-9
+    with_gap = replace(turned, dvl=turned.dvl.rows((t < 50.0) | (t > 55.0)))
+    (found,) = acting(with_gap)
+    assert found.quantity == "ranges to landmarks: turn of the sonar"
+
+
+def test_fixes_without_a_height_are_compared_in_the_level_alone():
+    run = fixed(SEEN, sigma_m=0.3)
+    cov = np.diag([0.09, 0.09, UNMEASURED_M2])
+    covs = np.tile(cov, (len(run.positions), 1, 1))
+    assert not acting(spoilt(run, "positions", covariance_m2=covs))
 
 
 @pytest.mark.parametrize(

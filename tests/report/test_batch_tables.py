@@ -197,6 +197,13 @@ def test_consistency_is_judged_over_runs_by_the_chi_square_band():
     assert (row["anees"], row["verdict"]) == ("", "")
 
 
+def test_a_missing_number_is_empty_in_the_csv_and_a_log_called_nan_is_not():
+    columns = [Column("log", "log", is_number=False), Column("error_m", "error")]
+    table = Table("errors", "", "", columns)
+    table.rows.append([Cell("nan", ("nan",)), Cell("-", (math.nan,))])
+    assert rows_of(table) == [{"log": "nan", "error_m": ""}]
+
+
 def test_sections_of_a_table_stand_in_its_csv():
     """Of two scores of one name a paper must mark the causal one."""
     rows = [[Cell("RMSE"), Cell("1.0", (1.0,))], [Cell("RMSE"), Cell("0.5", (0.5,))]]
