@@ -137,7 +137,8 @@ def with_force_axes(
     for k in np.flatnonzero(np.linalg.det(candidates) > 0).tolist():
         Q = at_imu.quadratic_form(candidates[k])
         for j, P in enumerate(candidates):
-            if is_of_force(candidates[k], P):
+            # gravity is felt upwards: of the accelerometers only level axes can be wrong
+            if P[2, 2] == 1.0 and is_of_force(candidates[k], P):
                 squares[k, j] = square_of(Q, P)
                 least[k, j], _ = least_of(Q)
 
@@ -240,8 +241,10 @@ class SharedRows:
     """Integral of the rate over each step, shape (n - 1, 3), body axes, rad."""
     impulse: Floats
     """Integral of the specific force, shape (n - 1, 3), m/s."""
+    seconds: Floats
+    """Of the rows of the Doppler log, shape (k,)."""
     row: np.ndarray
-    """Step at which each row of the Doppler log is, shape (k,)."""
+    """Step at which each of them is, shape (k,)."""
     rate: Floats
     """At the rows of the Doppler log, shape (k, 3), rad/s."""
     velocity: Floats
@@ -283,6 +286,7 @@ class SharedRows:
         return cls(
             np.diff(columns_at(grid_s, imu_s, running_integral(imu_s, w)), axis=0),
             np.diff(columns_at(grid_s, imu_s, running_integral(imu_s, f)), axis=0),
+            t,
             row,
             columns_at(t, imu_s, w),
             dvl.velocity[inside] @ body_R_dvl.T,
@@ -322,8 +326,10 @@ class SharedRows:
         for run, together in self.runs:
             changes = np.diff(means_over(columns[run], together), axis=0)
             flat = changes.reshape(len(changes), 30)
-            # gravity and its turning are of no interest
-            slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(flat)), 1)
+            # gravity and its turning, which gain the more the longer rows are apart, are of no interest
+            since = self.seconds[run] - self.seconds[run].mean()
+            gained = np.column_stack([since, since**2])
+            slow = np.diff(means_over(gained, together), axis=0)
             left = flat - slow @ (np.linalg.pinv(slow) @ flat)
             left = left.reshape(-1, 10)
             Q += left.T @ left
