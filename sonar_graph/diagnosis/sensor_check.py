@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Start
@@ -44,7 +45,12 @@ from sonar_graph.diagnosis.axes import (
     match_axes,
     turns_less_than_body,
 )
-from sonar_graph.diagnosis.causes import PITCH, pitched_one, velocity_steps
+from sonar_graph.diagnosis.causes import (
+    BEST_NOISE_M_S,
+    PITCH,
+    pitched_one,
+    velocity_steps,
+)
 from sonar_graph.diagnosis.findings import (
     ACTING_SIGMAS,
     ALSO,
@@ -123,9 +129,7 @@ from sonar_graph.navigation.alignment import (
     match_reference_to_imu,
     noise_densities,
 )
-from sonar_graph.navigation.dvl_screening import RowIntake
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Refusal
 
 YAW = "DVL mounting yaw"
 LEVEL_TURNS = ("DVL mounting roll", "DVL mounting pitch")
@@ -163,8 +167,10 @@ LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 LEAST_SHARE_OF_DELAY = 0.5
 """Share of a late IMU's delay that sightings and fixes show at least."""
-MOST_OUTLIERS = 0.1
-"""Share of velocities up to which those that no vehicle reaches are single wrong rows."""
+WILD = 7.0
+"""Median deviations from the rows about it, some five sigmas, beyond which a velocity is wild."""
+MOST_WILD = 0.1
+"""Share of velocities up to which wild ones are single wrong rows."""
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 BACKWARDS = -np.eye(3)
@@ -195,30 +201,37 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
 
 
 def of_usable_velocities(sequence: Sequence) -> Sequence:
-    """The sequence without what estimators refuse of the Doppler log: rows of too few beams, and outliers.
+    """The sequence without rows of the Doppler log of too few beams, and with wild rows between their neighbours.
 
-    An outlier gets the velocity between its neighbours, since the gyros' turn is taken at its stamp too. Where many rows
-    are refused, the log as a whole may have another unit or another noise, which is to be found.
+    A wild row stays, since the gyros' turn is taken at its stamp too. Where many are wild, the log is.
     """
     whole = ~is_partial(sequence.dvl.velocity_cov)
     if not whole.any():
         return sequence
     dvl = sequence.dvl if whole.all() else sequence.dvl.rows(np.flatnonzero(whole))
-    intake = RowIntake(sequence.calibration)
-    intake.add_dvl(dvl)
-    outlier_ns = [
-        row.stamp_ns for row in intake.refused if row.reason is Refusal.OUTLIER
-    ]
-    is_outlier = np.isin(dvl.stamps_ns, outlier_ns)
-    if 0.0 < is_outlier.mean() <= MOST_OUTLIERS:
-        usual_ns = dvl.stamps_ns[~is_outlier]
+    is_wild = are_wild(dvl.velocity)
+    if 0.0 < is_wild.mean() <= MOST_WILD:
+        usual_ns = dvl.stamps_ns[~is_wild]
         velocity = dvl.velocity.copy()
         for axis in velocity.T:
-            axis[is_outlier] = np.interp(
-                dvl.stamps_ns[is_outlier], usual_ns, axis[~is_outlier]
-            )
+            axis[is_wild] = np.interp(dvl.stamps_ns[is_wild], usual_ns, axis[~is_wild])
         dvl = replace(dvl, velocity=velocity)
     return replace(sequence, dvl=dvl)
+
+
+def are_wild(velocity: Floats) -> NDArray[np.bool_]:
+    """Rows far from the median of five about them, shape (n,): Hampel's filter.
+
+    The scale is the median deviation of the five, or that of all rows where it is larger: rows at rest agree by chance.
+    """
+    padded = np.pad(velocity, ((2, 2), (0, 0)), mode="edge")
+    five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)  # (n, 3, 5)
+    middle = np.median(five, axis=2)
+    off = np.abs(velocity - middle)
+    scatter = np.median(np.abs(five - middle[:, :, None]), axis=2)
+    usual = np.median(off, axis=0)
+    scale = np.maximum(np.maximum(scatter, usual), BEST_NOISE_M_S)
+    return np.asarray(np.linalg.norm(off / scale, axis=1) > WILD)
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
