@@ -286,8 +286,11 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         axes.append(pair.finding(YAW, in_degrees(match.turn[2]), TURNED))
         sequence = pair.corrected()
         match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    # gyros or velocities that are wrong by themselves are no reference for others
-    alone = (turn_rate_finding(sequence, config), velocity_steps(sequence))
+    # gyros or velocities that are wrong by themselves are no reference for others; late ones are not wrong
+    in_time = sequence
+    if matters(match.offset, LEAST_OFFSET_S):
+        in_time = replace(sequence, dvl=shifted(sequence.dvl, match.offset))
+    alone = (turn_rate_finding(in_time, config), velocity_steps(sequence))
     if rates := [finding for finding in alone if finding is not None]:
         return [*forces, *axes, *rates]
     leaning, sequence = leaning_pair(match, sequence)
@@ -871,15 +874,18 @@ def with_instant(offset: Estimate1D, imu: Imu) -> Estimate1D:
     return replace(offset, sigma=sigma)
 
 
+def shifted(dvl: Dvl, offset: Estimate1D) -> Dvl:
+    """The Doppler log with an offset added to its stamps, s."""
+    shift_ns = round(offset.value * NS_PER_S)
+    return replace(dvl, stamps_ns=dvl.stamps_ns + shift_ns)
+
+
 def corrected_sequence(
     sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]
 ) -> Sequence:
     """Sequence with the advised changes: stamps, yaw and scale of the DVL, lever arm, sigma of the gyro bias."""
     is_late, is_turned, is_scaled = (finding.acts for finding in of_dvl)
-    dvl = sequence.dvl
-    if is_late:
-        shift_ns = round(match.offset.value * NS_PER_S)
-        dvl = replace(dvl, stamps_ns=dvl.stamps_ns + shift_ns)
+    dvl = shifted(sequence.dvl, match.offset) if is_late else sequence.dvl
     if is_scaled:
         dvl = replace(dvl, velocity=dvl.velocity * match.scale.value)
     calibration = with_fitted(match, sequence.calibration)
