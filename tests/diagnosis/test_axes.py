@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Mounting
+from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.diagnosis.axes import (
     match_axes,
     signed_permutations,
     turns_less_than_body,
 )
 from sonar_graph.logs.adapters import LogConfig
+from sonar_graph.measurements import Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 from .runs import (
     acting,
+    dvl_rows,
     grave,
     line_of,
     recalibrated,
@@ -25,10 +27,12 @@ from .runs import (
     with_mounting,
     without_imu,
 )
+from .test_turn_rate import level_drive
 
 WORLD = simulate_mission(MissionOptions(duration_s=90.0, landmarks=1))
 MOUNTED = Mounting(rpy_rad=(0.3, -0.2, 1.0))
 IDENTITY = np.eye(3)
+UP = np.array([0.0, 0.0, 1.0])
 BODY_R_DVL = WORLD.calibration.dvl.mounting.pose().rotation().matrix()
 
 
@@ -55,7 +59,9 @@ def test_every_axis_and_sign_of_the_gyros_is_found(k: int) -> None:
     assert found_axes(with_axes(G, IDENTITY)) == (G.tolist(), IDENTITY.tolist())
 
 
-@pytest.mark.parametrize("axes", [(1, -1, 1), (-1, -1, 1), (-1, 1, 1), (1, -1, -1)])
+@pytest.mark.parametrize(
+    "axes", [(1, -1, 1), (-1, -1, 1), (-1, 1, 1), (1, -1, -1), (-1, -1, -1)]
+)
 def test_signs_of_the_doppler_log_are_found_and_the_gyros_left_alone(
     axes: tuple[float, float, float],
 ) -> None:
@@ -81,6 +87,39 @@ def test_level_axes_of_the_accelerometers_are_found_with_a_doppler_log_on_a_long
     place = np.add(WORLD.calibration.dvl.mounting.translation_m, arm_m)
     run = with_mounting(run, "dvl", translation_m=place.tolist())
     assert found_axes(run) == ((np.linalg.det(S) * S).tolist(), S.tolist())
+
+
+def test_gravity_over_a_gap_in_a_slow_doppler_log_is_no_change_of_velocity() -> None:
+    """Rows a second apart, and one interval of three seconds."""
+    run = level_drive(0)
+    slow = run.dvl.rows(slice(None, None, 5))
+    t = (slow.stamps_ns - run.start_ns) * 1e-9
+    negated = replace(slow, velocity=-slow.velocity)
+    with_gap = replace(run, dvl=negated.rows((t < 39.5) | (t > 41.5)))
+    gyro, dvl = found_axes(with_gap)
+    assert gyro == IDENTITY.tolist()
+    # ahead is the one way that this vehicle goes
+    assert dvl[0] == [-1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_way_straight_up_and_down_is_none_in_axes_of_the_world(seed: int) -> None:
+    """A vehicle that pitches, whose level velocities are hardly more than their noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 60.0, 0.02)
+    stamps_ns = np.rint(t * 1e9).astype(np.int64)
+    pitch_rad = 0.05 * np.sin(0.5 * t + seed)
+    body_R_world = Rotation.from_euler("y", pitch_rad[:, None]).inv()
+    climb = np.outer(np.sin(0.2 * t), UP)
+    gravity = np.gradient(climb, t, axis=0) + 9.80665 * UP
+    rate = np.outer(np.gradient(pitch_rad, t), [0.0, 1.0, 0.0])
+    rate += 1e-3 * rng.standard_normal(rate.shape)
+    force = body_R_world.apply(gravity) + 0.01 * rng.standard_normal(rate.shape)
+    velocity = body_R_world.apply(climb) + 0.03 * rng.standard_normal(rate.shape)
+    slow = slice(None, None, 10)
+    dvl = dvl_rows(stamps_ns[slow], velocity[slow])
+    imu = Imu(stamps_ns, rate, force)
+    assert turns_less_than_body(imu, dvl, Calibration()) is None
 
 
 def test_without_accelerometers_or_motion_nothing_is_known() -> None:

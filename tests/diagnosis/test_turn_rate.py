@@ -1,5 +1,7 @@
 """Gyros that are wrong about the vertical, of a vehicle made by hand: named without a compass, fixes or landmarks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,19 @@ def test_angle_increments_are_found_with_the_factor_to_rates():
     finding, *_ = check_sensors(level_drive(0, lambda rate: rate / HZ))
     assert finding.quantity == TURN_RATE
     assert "`angular_velocity_scale = 50`" in finding.line
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
+    """Beside a gap the velocity is known on one side only."""
+    wave = 0.8 * np.sin(1.5 * T + seed)
+    velocity = np.outer(wave, [0.0, 1.0, 0.0])
+    velocity[:, 0] = 0.6
+    run = level_vehicle(velocity, 0.02 * np.sin(0.2 * T), seed)
+    t = (run.dvl.stamps_ns - run.start_ns) * 1e-9
+    is_lost = ((t > 20.0) & (t < 24.0)) | ((t > 40.0) & (t < 43.5))
+    with_gaps = replace(run, dvl=run.dvl.rows(~is_lost))
+    assert TURN_RATE not in names(check_sensors(with_gaps))
 
 
 @pytest.mark.parametrize("seed", range(2))
