@@ -167,6 +167,8 @@ LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 LEAST_SHARE_OF_DELAY = 0.5
 """Share of a late IMU's delay that sightings and fixes show at least."""
+LEAST_SPEED_SIGMAS = 10.0
+"""Level speed over the noise of a good Doppler log, from which on its slow errors are no bias of the gyros."""
 WILD = 7.0
 """Median deviations from the rows about it, some five sigmas, beyond which a velocity is wild."""
 MOST_WILD = 0.1
@@ -303,6 +305,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     x, y, z = (
         replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias
     )
+    if level_speed_m_s(sequence.dvl) < LEAST_SPEED_SIGMAS * BEST_NOISE_M_S:
+        z = unknown("too slow for a turn to bend the path")
     driven = (unknown(NO_GRAVITY),) * 3 if lacks_gravity(sequence) else (x, y, z)
     of_dvl = dvl_findings(match, sequence, config)
     # each following check sees the log as these lines would make it
@@ -872,6 +876,11 @@ def with_instant(offset: Estimate1D, imu: Imu) -> Estimate1D:
     interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
     sigma = float(np.hypot(offset.sigma, interval_s / np.sqrt(12)))
     return replace(offset, sigma=sigma)
+
+
+def level_speed_m_s(dvl: Dvl) -> float:
+    """Root mean square along x and y of the Doppler log."""
+    return float(np.sqrt(np.mean(np.sum(dvl.velocity[:, :2] ** 2, axis=1))))
 
 
 def shifted(dvl: Dvl, offset: Estimate1D) -> Dvl:
