@@ -44,12 +44,25 @@ float64 yaw_rad
 float64 sigma_rad"""
 
 
+STYLES = (
+    "wander",
+    "wander",
+    "straight",
+    "mower",
+    "hover",
+    "profile",
+    "sideways",
+    "waves",
+)
+"""Ways of motion: legs and turns are those of a mower, a hovering vehicle begins at rest, a profile goes up and down."""
+
+
 @dataclass(frozen=True)
 class World:
     """What differs between two dives."""
 
     style: str
-    """wander, straight, mower (legs and turns), or hover (at rest, then a transit)."""
+    """One of `STYLES`."""
     depth_m: float
     speed_m_s: float
     imu_hz: float
@@ -95,7 +108,7 @@ class World:
             for begin in rng.uniform(8.0, 50.0, rng.integers(3))
         ]
         return cls(
-            style=str(rng.choice(["wander", "wander", "straight", "mower", "hover"])),
+            style=str(rng.choice(STYLES)),
             depth_m=float(rng.uniform(1.0, 60.0)),
             speed_m_s=float(rng.uniform(0.3, 1.5)),
             imu_hz=float(rng.choice([20.0, 50.0, 100.0, 200.0])),
@@ -174,11 +187,11 @@ def motion(
         steps_rad *= 0.05
         climbs_m *= 0.1
     elif world.style == "mower":
-        place = np.arange(n) % 12
+        leg = np.arange(n) % 12
         steps_rad = (
             0.05 * steps_rad
-            + np.pi / 2 * np.isin(place, (4, 5))
-            - np.pi / 2 * np.isin(place, (10, 11))
+            + np.pi / 2 * np.isin(leg, (4, 5))
+            - np.pi / 2 * np.isin(leg, (10, 11))
         )
     elif world.style == "hover":
         is_hovering = knots < DURATION_S / 2
@@ -190,12 +203,35 @@ def motion(
     level = np.cumsum(KNOT_S * (speed + 1j * sway) * np.exp(1j * yaw)) + complex(
         *rng.uniform(-50.0, 50.0, 2)
     )
-    z = np.minimum(-world.depth_m + np.cumsum(climbs_m), -0.5)
+    z = -world.depth_m + np.cumsum(climbs_m)
+    if world.style == "profile":
+        level = level[0] + 0.05 * (level - level[0])
+        z = z + 4.0 * np.sin(2.0 * np.pi * knots / rng.uniform(25.0, 50.0))
+    elif world.style == "sideways":
+        yaw = yaw + rng.uniform(-np.pi, np.pi)
+    z = np.minimum(z, -0.5)
     tilt = 0.04 * rng.standard_normal((2, n))
     attitudes = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt[0], tilt[1]]))
-    return CubicSpline(
-        knots, np.column_stack([level.real, level.imag, z])
-    ), RotationSpline(knots, attitudes)
+    place = CubicSpline(knots, np.column_stack([level.real, level.imag, z]))
+    attitude = RotationSpline(knots, attitudes)
+    return swung(place, attitude, rng) if world.style == "waves" else (place, attitude)
+
+
+def swung(
+    place: CubicSpline, attitude: RotationSpline, rng: np.random.Generator
+) -> tuple[CubicSpline, RotationSpline]:
+    """The motion with a swell from one side, in which the vehicle heaves, is carried to and fro, rolls and pitches."""
+    t = np.arange(-15.0, DURATION_S + 25.0, 0.25)
+    phase = 2.0 * np.pi * t / rng.uniform(4.0, 9.0)
+    side = rng.uniform(-np.pi, np.pi)
+    carried = np.outer(np.cos(phase), [np.cos(side), np.sin(side), 0.0])
+    heave = np.outer(np.sin(phase), [0.0, 0.0, 1.0])
+    shifts = rng.uniform(0.0, 2.0 * np.pi, 3)
+    angles = np.column_stack([np.sin(phase + shift) for shift in shifts])
+    turn = np.radians(rng.uniform(2.0, 6.0)) * angles * [0.3, 0.6, 1.0]
+    places = place(t) + rng.uniform(0.2, 0.6) * (carried + heave)
+    attitudes = attitude(t) * Rotation.from_euler("ZYX", turn)
+    return CubicSpline(t, places), RotationSpline(t, attitudes)
 
 
 def make_log(seed: list[int], needs: frozenset[str] = frozenset()) -> Log:
