@@ -505,11 +505,12 @@ def axes_findings(
     # the accelerometers' own axes come first
     if gravity_warning(force, calibration.imu.mounting, calibration.gravity_m_s2):
         return [], sequence
+    found = match_axes(sequence.imu, sequence.dvl, calibration)
     ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
-    if ratio is not None:
+    # turns of the wrong sense fit no velocities of the body either
+    if ratio is not None and (found is None or found.ratio < ratio):
         cause = f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle"
         return [no_axes_finding(DVL_AXES, cause)], sequence
-    found = match_axes(sequence.imu, sequence.dvl, calibration)
     # steps of a velocity fit no axes, and have a finding of their own
     if found is None or (found.is_mixed and velocity_steps(sequence) is not None):
         return [], sequence

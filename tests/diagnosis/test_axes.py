@@ -21,6 +21,7 @@ from .runs import (
     acting,
     dvl_rows,
     grave,
+    level_vehicle,
     line_of,
     recalibrated,
     spoilt,
@@ -142,6 +143,18 @@ def test_a_negated_gyro_yaw_is_the_first_finding_with_its_line(
     assert finding.quantity == "gyro axes"
     assert finding.grave
     assert line_of(finding) == {"angular_velocity_axes": [*given[:2], "-z"]}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_negated_gyro_yaw_is_named_where_most_of_a_log_is_a_rest(seed: int) -> None:
+    """Velocities in axes of the world fit such turns better than those of the body, but not as well as right turns."""
+    t = np.arange(0.0, 60.0, 0.02)
+    speed = 0.6 * (1.0 + np.tanh(t - 40.0)) + 0.01 * np.sin(0.3 * t + seed)
+    yaw_rate = 0.25 * np.sin(0.25 * t + seed)
+    run = level_vehicle(np.outer(speed, [1.0, 0.0, 0.0]), yaw_rate, seed)
+    rate = run.imu.angular_velocity * [1.0, 1.0, -1.0]
+    finding, *_ = acting(spoilt(run, "imu", angular_velocity=rate))
+    assert finding.quantity == "gyro axes"
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
