@@ -178,8 +178,15 @@ def force_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
 
 
 def force_scale(sequence: Sequence, config: LogConfig) -> Finding | None:
-    """Typical specific force over gravity; None where the accelerometers do not measure gravity."""
-    forces = lengths(sequence.imu.specific_force)
+    """Typical specific force over gravity; None where the accelerometers do not measure gravity.
+
+    Of means over a second, since a hull that shakes makes single forces longer.
+    """
+    is_measured = np.isfinite(sequence.imu.specific_force).all(axis=1)
+    seconds = sequence.imu.stamps_ns[is_measured] // NS_PER_S
+    _, first, count = np.unique(seconds, return_index=True, return_counts=True)
+    sums = np.add.reduceat(sequence.imu.specific_force[is_measured], first, axis=0)
+    forces = lengths(sums / count[:, None])
     gravity = sequence.calibration.gravity_m_s2
     typical = float(np.median(forces)) if len(forces) else 0.0
     if not 1 / MOST_OF_GRAVITY < typical / gravity < MOST_OF_GRAVITY:

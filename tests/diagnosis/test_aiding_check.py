@@ -243,6 +243,13 @@ def test_the_scale_of_the_accelerometers_is_that_of_gravity(factor, is_told):
         assert key == pytest.approx(1 / factor, rel=2e-3)
 
 
+def test_a_hull_that_shakes_makes_no_accelerometers_of_another_scale():
+    """Forces across gravity make each one longer, not their mean."""
+    shaking = np.random.default_rng(0).normal(0.0, 3.0, RIGHT.imu.specific_force.shape)
+    run = spoilt(RIGHT, "imu", specific_force=RIGHT.imu.specific_force + shaking)
+    assert not force_scale(run, NO_CONFIG).acts
+
+
 @pytest.mark.parametrize("period_s", [4.0, 8.0])
 def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: float):
     """By hand: the integral of a sine over rows a second apart is too small by ``(w T)^2 / 12``."""
