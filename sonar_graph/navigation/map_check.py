@@ -125,13 +125,14 @@ def map_fit(sequence: Sequence) -> MapFit:
     is_doubted = 2 * before <= seen
     for mistake, T in MISTAKES.items() if before < seen else ():
         corrected = followed(sequence, undone(known, T))
+        after = agreeing(corrected)
+        if after <= before or 2 * after <= seen:
+            continue
         gain = evidence(corrected) - evidence(given)
         # in another unit the map has another area, and wrong identities another density
         is_same_area = bool(np.isclose(abs(np.linalg.det(T)), 1.0))
         is_clear = is_same_area and math.isfinite(gain) and gain > math.log(CLEAR)
-        is_better = is_clear or (is_doubted and fits(corrected.newest(), corrected.map))
-        after = agreeing(corrected)
-        if is_better and after > before and 2 * after > seen:
+        if is_clear or (is_doubted and gives_start(sequence, corrected.map)):
             return MapFit(None, mistake, remedy_of(known, T))
     swaps = exchanged_identities(given.sightings, known)
     if swaps:
@@ -141,7 +142,7 @@ def map_fit(sequence: Sequence) -> MapFit:
     looser = known.model_copy(
         update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
     )
-    if fits(given.newest(), looser):
+    if gives_start(sequence, looser):
         factor = f"give sigmas up to {SIGMA_FACTOR:g} times as large"
         return MapFit(None, "its sigmas are too small", factor)
     return MapFit(None)
@@ -279,13 +280,15 @@ def shown(locator: MapLocator) -> float:
     return float(np.mean([sighting.is_in_view for sighting in locator.sightings]))
 
 
-def fits(sightings: list[MapSighting], known: KnownMap) -> bool:
-    """Check that sightings give a start, by enough landmarks and more than half of those that were seen."""
-    start = located(sightings, known)
-    if start is None:
-        return False
-    seen = len({sighting.row for sighting in sightings})
-    return len(start.agreeing) >= FEWEST and 2 * len(start.agreeing) > seen
+def gives_start(sequence: Sequence, known: KnownMap) -> bool:
+    """Check that sightings give a start, by enough landmarks and more than half of those that were seen by then."""
+    for locator in locators(sequence, known):
+        newest = locator.newest()
+        start = located(newest, known)
+        most = max(FEWEST, 1 + len({sighting.row for sighting in newest}) // 2)
+        if start is not None and len(start.agreeing) >= most:
+            return True
+    return False
 
 
 def undone(known: KnownMap, T: np.ndarray) -> KnownMap:
