@@ -61,6 +61,7 @@ from sonar_graph.models import (
     locate,
 )
 from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.states import (
     FIRST_ANONYMOUS_ID,
     DetectionLog,
@@ -96,6 +97,7 @@ LEAST_RISE = 0.05
 WATCHED_S = 120.0
 """Time after the vehicle was located in which a better start replaces a wrong one."""
 LOCATED_AGAIN = "located again in the map"
+NEAR = chi_square_quantile(0.999, 3)
 SAME = 10.0
 """Distance, in sigmas, of starts that are refined to the same one."""
 STEPS = 5
@@ -202,8 +204,11 @@ class MapLocator:
             best = located(self.newest(), self.map)
             if best is None:
                 continue
-            if self.found is not None and not outweighs(best, self.found, data):
-                continue
+            if self.found is not None:
+                is_better = outweighs(best, self.found, data)
+                # the estimator finds its own way from a start that is near enough
+                if not is_better or is_near(best, self.found):
+                    continue
             # a few fit a mirror image, or a map of another place, by chance; each new start repeats the run until now
             by_all = refined(best.parameters, data)
             moved = [] if by_all is None else moved_landmarks(by_all, data)
@@ -700,7 +705,9 @@ def least_squares(
     covariance = np.zeros((3, 3))
     for _ in range(STEPS):
         agrees, agreeing = agreement(parameters, covariance, agreeing, data)
-        agrees[kept] = data.is_of[kept]
+        # wrong identities count against no start: only a landmark that disagrees as a whole counts with all sightings
+        disagreeing = kept & ~agreeing
+        agrees[disagreeing] = data.is_of[disagreeing]
         agreeing = (agreeing | kept) & ~left_out
         if np.count_nonzero(agreeing) < 2:
             return None
@@ -802,6 +809,14 @@ def is_linear(start: FoundStart, data: MapData) -> bool:
     second_order_m = 0.5 * squared_rad2 * np.linalg.norm(data.q, axis=1)
     sigma_m = np.sqrt(0.5 * np.trace(data.S, axis1=1, axis2=2))
     return float(second_order_m.mean()) <= float(sigma_m.mean())
+
+
+def is_near(start: FoundStart, other: FoundStart) -> bool:
+    """Check that two starts differ by no more than both are uncertain, within 99.9 %."""
+    d = start.parameters - other.parameters
+    d[0] = math.remainder(d[0], 2.0 * math.pi)
+    P = start.covariance + other.covariance
+    return float(d @ np.linalg.solve(P, d)) <= NEAR
 
 
 def is_same(parameters: Floats, better: FoundStart) -> bool:
