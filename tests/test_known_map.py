@@ -445,7 +445,9 @@ def test_the_prior_of_a_found_start_is_as_uncertain_as_it_was_found():
     """Heading and place each by their own sigma, three times as large."""
     locator = MapLocator(Calibration(map=random_map(np.random.default_rng(1), 3)))
     P = np.diag([0.05, 0.3, 0.4]) ** 2
-    locator.found = FoundStart(np.array([0.7, 4.0, 5.0]), P, 0.0, frozenset({0, 1}))
+    locator.found = FoundStart(
+        np.array([0.7, 4.0, 5.0]), P, 0.0 * P, 0.0, frozenset({0, 1})
+    )
     start = locator.start()
     assert start.rpy_rad[2] == pytest.approx(0.7)
     assert start.position_m[:2] == pytest.approx((4.0, 5.0))

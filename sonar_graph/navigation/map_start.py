@@ -84,8 +84,11 @@ MOST_OF_LANDMARK = 4
 LINEAR_SIGMAS = 3.0
 """Error of the heading that is found, in sigmas, up to which a sighting must be linear in it within its own sigma."""
 LOOSER = 3.0
-"""Sigmas of the prior start over those found: the estimator weighs the same sightings itself, so that a ninth of their
+"""Sigmas of the prior start over those that the sightings leave: the estimator weighs them itself, so that a ninth of their
 information counts twice. With a looser prior it would follow a moved landmark that it sees first."""
+LOOSER_THAN_MAP = 10.0
+"""The same of the place over those that the map's errors leave: a hundredth of what the map knows counts twice, and again
+with each dive in the map of the last one."""
 SELDOM = 8
 """Number of its sightings up to which each one of a landmark is news; after that their mean changes little."""
 NEWS_SHARE = 0.05
@@ -131,6 +134,8 @@ class FoundStart(NamedTuple):
     """(psi, t_x, t_y), shape (3,), rad and m."""
     covariance: Floats
     """Shape (3, 3)."""
+    of_map: Floats
+    """The part of it that the map's errors make."""
     log_evidence: float
     """Logarithm of (2)."""
     agreeing: frozenset[int]
@@ -391,10 +396,14 @@ class MapLocator:
         return self.map.without(self.moved)
 
     def start(self) -> Start:
-        """Prior start at the place that was found, `LOOSER` than it is known."""
+        """Prior start at the place that was found, looser than it is known."""
         assert self.found is not None
         psi, x, y = self.found.parameters.tolist()
-        sigmas = LOOSER * np.sqrt(np.diag(self.found.covariance))
+        variances = np.diag(self.found.covariance)
+        of_map = np.diag(self.found.of_map)
+        # filters are linearised about the heading, which must not be looser than it needs
+        factors = np.array([LOOSER, LOOSER_THAN_MAP, LOOSER_THAN_MAP])
+        sigmas = np.sqrt(LOOSER**2 * (variances - of_map) + factors**2 * of_map)
         start = self._calibration.start
         roll, pitch, _ = start.rpy_rad
         level_sigma_m = float(max(sigmas[1:].max(), 0.1))
@@ -678,7 +687,7 @@ def refined(
     prior = math.log(2.0 * math.pi * data.area_m2)
     rows = frozenset(seen[fit.agreeing].tolist())
     log_evidence = right + wrong + volume - prior
-    return FoundStart(fit.parameters, fit.covariance, log_evidence, rows)
+    return FoundStart(fit.parameters, fit.covariance, fit.of_map, log_evidence, rows)
 
 
 class Fit(NamedTuple):
@@ -688,6 +697,8 @@ class Fit(NamedTuple):
     """Shape (3,)."""
     covariance: Floats
     """Shape (3, 3)."""
+    of_map: Floats
+    """The part of it that the map's errors make."""
     agreeing: Any
     """Shape (l,)."""
     squared: Floats
@@ -717,7 +728,8 @@ def least_squares(
         e = (data.places[seen[agreeing]] - q @ R.T - parameters[1:]).ravel()  # (2 a,)
         all_R = np.kron(np.eye(a), R)
         coordinates = np.add.outer(2 * seen[agreeing], np.arange(2)).ravel()
-        W = all_R @ Q @ all_R.T + data.M[np.ix_(coordinates, coordinates)]  # (2 a, 2 a)
+        M = data.M[np.ix_(coordinates, coordinates)]  # (2 a, 2 a)
+        W = all_R @ Q @ all_R.T + M
         W_inv = np.linalg.inv(W)
         by_psi = q @ turn(parameters[0] + 0.5 * math.pi).T
         by_t = np.tile(np.eye(2), (a, 1))
@@ -738,7 +750,9 @@ def least_squares(
     squared = np.zeros(a)
     if a > 2:
         squared = (residual * np.linalg.solve(own, residual)).sum(axis=(1, 2))
-    return Fit(parameters, covariance, agreeing, squared, log_density)
+    gain = covariance @ weighted.T  # (3, 2 a)
+    of_map = gain @ M @ gain.T
+    return Fit(parameters, covariance, of_map, agreeing, squared, log_density)
 
 
 def agreement(
