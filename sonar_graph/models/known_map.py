@@ -5,7 +5,8 @@ azimuth. One beyond `CONTRADICTS` contradicts the map. It is a wrong identity, o
 contradict here and there; a landmark that has moved is contradicted each time, and one contradiction follows the last one
 soon or is like it. So a landmark is contradicted from `FEWEST` such contradictions in a row on, where all contradictions
 are more than half of its sightings. As long as fewer landmarks are contradicted
-than agree, it has moved, and the estimator maps it again. Where as many are contradicted, the start may be wrong, or those
+than agree, it has moved. The estimator maps it again once `FEWEST` contradictions are alike: those of wrong identities show
+no place. Where as many are contradicted, the start may be wrong, or those
 that agree have moved: then their sightings are refused, and a message names both.
 """
 
@@ -58,6 +59,8 @@ class KnownLandmarks:
         """Stamp and innovation of the last contradiction, by landmark."""
         self._in_a_row: Counter[int] = Counter()
         """Contradictions that follow the one before soon, or are like it, until now."""
+        self._alike: Counter[int] = Counter()
+        """Contradictions that are like the one before: what they show stands in one place."""
         self._elsewhere: set[int] = set()
         """Landmarks with `FEWEST` of them."""
 
@@ -76,7 +79,9 @@ class KnownLandmarks:
             return Verdict.USE
         self._contradict(landmark_id, stamp_ns, e, S)
         contradicted = self._contradicted()
-        if landmark_id not in contradicted or not self._is_outvoted(contradicted):
+        is_in_one_place = self._alike[landmark_id] >= FEWEST
+        is_clear = landmark_id in contradicted and self._is_outvoted(contradicted)
+        if not (is_clear and is_in_one_place):
             return Verdict.REFUSE
         self.moved.append(landmark_id)
         # what has left a bounded window cannot be taken out again
@@ -99,6 +104,7 @@ class KnownLandmarks:
         self._in_a_row[landmark_id] += 1
         if self._in_a_row[landmark_id] >= FEWEST:
             self._elsewhere.add(landmark_id)
+        self._alike[landmark_id] += int(is_alike)
 
     def _contradicted(self) -> list[int]:
         """Landmarks that the map still holds against most of their sightings."""
@@ -159,16 +165,17 @@ class KnownLandmarks:
         if self._is_outvoted(contradicted):
             moved = [*moved, *contradicted]
             contradicted = []
-        again = [i for i in moved if self._may_release or i in self.map.moved]
+        again = [i for i in moved if i not in self.held or i in self.map.moved]
         if again:
             lines.append(
                 f"{MOVED}: {named(again)}: mapped again; correct the map, or its sigmas where they are too small"
             )
         refused = sorted({*moved}.difference(again))
         if refused:
+            whole = ", or give history.policy = whole to map them again"
+            way_out = f"correct the map{'' if self._may_release else whole}"
             lines.append(
-                f"{MOVED}: {named(refused)}: their sightings are refused; correct the map, or give history.policy = "
-                "whole to map them again"
+                f"{MOVED}: {named(refused)}: their sightings are refused; {way_out}"
             )
         if contradicted:
             agreeing = (self.held & self.seen).difference(contradicted, moved)
