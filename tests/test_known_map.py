@@ -181,6 +181,34 @@ def test_what_landmarks_of_a_map_share_stays_also_if_one_moved(dive, kind, shift
     assert variance == pytest.approx(1.0 / (common_m**-2 + start_m**-2), rel=0.01)
 
 
+def test_a_start_found_in_a_map_takes_nothing_off_what_all_landmarks_share(dive):
+    """The start has the map's error in it: it tells nothing of the map, dive by dive."""
+    common_m = 0.5
+    known = surveyed(dive)
+    n = len(known.ids)
+    joint = SIGMA_M**2 * np.eye(3 * n)
+    joint += common_m**2 * np.kron(np.ones((n, n)), np.eye(3))
+    known = KnownMap.of(known.ids, known.positions_m, covariance_m2=joint)
+    estimator, _ = run(EkfSlam, with_map(dive, known, unknown_start(dive)))
+    mean_x = np.kron(np.full(n, 1.0 / n), [1.0, 0.0, 0.0])  # (3 n,)
+    variance = mean_x @ known_map_of(estimator).joint() @ mean_x
+    assert variance == pytest.approx(common_m**2, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_identities_do_not_make_a_right_start_begin_again(dive, seed):
+    rng = np.random.default_rng(seed)
+    seen = dive.detections
+    is_wrong = rng.random(len(seen.stamps_ns)) < 0.15
+    known = surveyed(dive, seed)
+    names = rng.choice(known.ids, len(is_wrong))[:, None]
+    ids = np.where(is_wrong[:, None], names, seen.candidate_ids)
+    misnamed = replace(dive, detections=replace(seen, candidate_ids=ids))
+    locator = locator_after(with_map(misnamed, known, unknown_start(dive)))
+    assert locator.found is not None
+    assert locator.again_s() == []
+
+
 @each
 def test_landmarks_of_the_map_that_are_not_seen_are_named(dive, kind):
     known = surveyed(dive)
