@@ -6,6 +6,9 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
@@ -550,6 +553,30 @@ def test_three_landmarks_that_agree_are_no_start_where_most_do_not(others, is_fo
     assert (found is not None) == is_found
     if found is not None:
         np.testing.assert_allclose(found.parameters, [0.0, *FROM_THE_START], atol=0.5)
+
+
+def test_the_evidence_of_a_start_is_the_integral_over_all_starts():
+    """(2), by importance sampling: a uniform prior over headings and the area, one wrong identity anywhere in it."""
+    rng = np.random.default_rng(2)
+    known = random_map(rng, 5)
+    right = [seen_from_start(known, i, 0.03 * (-1) ** i) for i in range(4)]
+    wrong = MapSighting(4, np.array([40.0, -30.0]), SEEN_M2)
+    data = map_data([*right, wrong], known)
+    found = refined(np.array([0.0, *FROM_THE_START]), data)
+    assert found.agreeing == {0, 1, 2, 3}
+    about = multivariate_normal(found.parameters, 2.0 * found.covariance, seed=rng)
+    drawn = about.rvs(20_000)  # (n, 3)
+    log_density = -about.logpdf(drawn)
+    for k, (psi, *t) in enumerate(drawn):
+        R = Rotation.from_euler("z", psi).as_matrix()[:2, :2]
+        W = R @ SEEN_M2 @ R.T + 0.05**2 * np.eye(2)
+        e = [known.positions_m[s.row][:2] - R @ s.q - t for s in right]
+        log_density[k] += multivariate_normal.logpdf(e, np.zeros(2), W).sum()
+    expected = logsumexp(log_density) - np.log(len(drawn))
+    expected -= np.log(2.0 * np.pi * data.area_m2)
+    expected += data.weights.right[:4].sum()
+    expected += data.weights.wrong[4] - np.log(data.area_m2)
+    assert found.log_evidence == pytest.approx(expected, abs=0.05)
 
 
 def test_a_third_landmark_far_from_two_others_agrees_with_their_start():
