@@ -133,7 +133,12 @@ def map_fit(sequence: Sequence) -> MapFit:
         is_same_area = bool(np.isclose(abs(np.linalg.det(T)), 1.0))
         is_clear = is_same_area and math.isfinite(gain) and gain > math.log(CLEAR)
         if is_clear or (is_doubted and gives_start(sequence, corrected.map)):
-            return MapFit(None, mistake, remedy_of(known, T))
+            remedy = remedy_of(known, T)
+            if mistake == MIRRORED:
+                remedy += (
+                    ", where they are swapped; else negate the one of the wrong sign"
+                )
+            return MapFit(None, mistake, remedy)
     swaps = exchanged_identities(given.sightings, known)
     if swaps:
         return MapFit(None, *of_swaps(swaps))

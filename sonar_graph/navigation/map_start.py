@@ -290,7 +290,8 @@ class MapLocator:
             )
         return (
             f"of its landmarks {seen} were identified, and no place explains them {ODDS:g} times better than all others "
-            "together: few landmarks or wrong identities, sigmas of the map that are too small, or another map"
+            "together: few landmarks or wrong identities, sigmas of the map that are too small, another unit, or another "
+            "map; `sonar-graph inspect LOG --map FILE` looks for its mistake"
         )
 
     def _see(self, frame: LandmarkDetections) -> bool:
