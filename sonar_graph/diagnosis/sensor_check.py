@@ -169,8 +169,8 @@ LEAST_SHARE_OF_DELAY = 0.5
 """Share of a late IMU's delay that sightings and fixes show at least."""
 LEAST_SPEED_SIGMAS = 10.0
 """Level speed over the noise of a good Doppler log, from which on its slow errors are no bias of the gyros."""
-WILD = 7.0
-"""Median deviations from the rows about it, some five sigmas, beyond which a velocity is wild."""
+WILD = 5.0
+"""Median deviations from the rows about it, three to four sigmas, beyond which a velocity may be wild."""
 MOST_WILD = 0.1
 """Share of velocities up to which wild ones are single wrong rows."""
 UPRIGHT = np.array([0.0, 0.0, 1.0])
@@ -225,6 +225,7 @@ def are_wild(velocity: Floats) -> NDArray[np.bool_]:
     """Rows far from the median of five about them, shape (n,): Hampel's filter.
 
     The scale is the median deviation of the five, or that of all rows where it is larger: rows at rest agree by chance.
+    A wild row is also nearer to neither neighbour than they are to each other: a vehicle that begins to turn is not wild.
     """
     padded = np.pad(velocity, ((2, 2), (0, 0)), mode="edge")
     five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)  # (n, 3, 5)
@@ -233,7 +234,15 @@ def are_wild(velocity: Floats) -> NDArray[np.bool_]:
     scatter = np.median(np.abs(five - middle[:, :, None]), axis=2)
     usual = np.median(off, axis=0)
     scale = np.maximum(np.maximum(scatter, usual), BEST_NOISE_M_S)
-    return np.asarray(np.linalg.norm(off / scale, axis=1) > WILD)
+    is_far = np.linalg.norm(off / scale, axis=1) > WILD
+    beside = np.pad(velocity, ((1, 1), (0, 0)), mode="reflect")
+    before = beside[:-2]
+    after = beside[2:]
+    nearest = np.minimum(
+        np.linalg.norm(velocity - before, axis=1),
+        np.linalg.norm(velocity - after, axis=1),
+    )
+    return np.asarray(is_far & (nearest > np.linalg.norm(after - before, axis=1)))
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:

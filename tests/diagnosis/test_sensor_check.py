@@ -433,3 +433,21 @@ def test_imu_stamps_of_a_wrong_clock_have_one_line(drift: float) -> None:
     first, *others = acting(replace(fast, notes=note))
     assert '`stamp = "log"` under [imu]' in first.line
     assert not any("stamp_offset_s" in other.line for other in others)
+
+
+def test_a_vehicle_that_begins_to_turn_is_not_wild_and_a_single_row_is() -> None:
+    """Rows of A-KIT 1, a second apart, where the vehicle begins to turn."""
+    velocity = np.array(
+        [
+            [2.257, 0.07, 0.018],
+            [2.27, 0.101, 0.004],
+            [2.244, 0.265, 0.0],
+            [1.963, 0.837, -0.098],
+            [1.773, 0.718, -0.005],
+            [1.643, 0.585, 0.044],
+            [1.58, 0.492, 0.018],
+        ]
+    )
+    assert not sensor_check.are_wild(velocity).any()
+    velocity[4] += [0.0, -1.5, 0.4]
+    assert np.flatnonzero(sensor_check.are_wild(velocity)).tolist() == [4]
