@@ -331,12 +331,11 @@ def run(
         squared = pose @ np.linalg.solve(P, pose)
         rows.append((*e[:2], nees, np.linalg.norm(turn), squared))
     columns = np.array(rows)
-    nees, turn_rad, pose_squared = columns[:, 2:].T
     return Run(
         columns[:, :2],
-        nees,
-        turn_rad,
-        pose_squared,
+        columns[:, 2],
+        columns[:, 3],
+        columns[:, 4],
         stamps_ns,
         withheld_of(estimator),
         known_map_of(estimator),

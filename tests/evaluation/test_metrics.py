@@ -232,3 +232,12 @@ def test_yaw_alignment_leaves_a_tilt_that_se3_removes():
 def test_unpaired_points_are_refused(shapes):
     with pytest.raises(EvaluationError, match="paired points"):
         metrics.umeyama(np.zeros(shapes[0]), np.zeros(shapes[1]))
+
+
+def test_motions_over_a_second_want_a_truth_at_the_same_instants():
+    stamps_ns = np.arange(100) * 100_000_000
+    path = Trajectory.without_covariances(
+        stamps_ns, np.zeros((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1))
+    )
+    with pytest.raises(EvaluationError, match="at the same instants"):
+        metrics.relative_errors(path, path.rows(np.arange(50)), 1.0)
