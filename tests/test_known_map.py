@@ -19,7 +19,12 @@ from sonar_graph.estimator import known_map_of
 from sonar_graph.evaluation import compare
 from sonar_graph.map_file import in_map, read_map, write_map
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.models import KnownLandmarks, elevation_on_floor, locate
+from sonar_graph.models import (
+    LOCATED_AGAIN,
+    KnownLandmarks,
+    elevation_on_floor,
+    locate,
+)
 from sonar_graph.navigation import Odometry, make_estimator
 from sonar_graph.navigation.map_check import exchanged_identities, map_fit
 from sonar_graph.navigation.map_start import (
@@ -245,6 +250,14 @@ def test_a_landmark_has_moved_if_most_of_its_sightings_contradict_it():
     assert judged(agree + [(0, RIGHT)] * 3 + [(0, WRONG)] * 3).moved == []
     both = judged(agree + [(0, WRONG)] * 3 + [(4, WRONG)] * 3)
     assert both.moved == [0, 4]
+
+
+def test_a_landmark_that_only_contradicts_the_map_does_not_vouch_for_it():
+    """One landmark agrees, as one that has moved and was seen first does: it outvotes nobody."""
+    agree = [(1, RIGHT)] * 9 + [(2, WRONG)] * 2
+    known = judged(agree + [(0, WRONG)] * 3)
+    assert known.moved == []
+    assert any("too few others agree" in message for message in known.messages())
 
 
 def test_wrong_identities_here_and_there_are_no_landmark_that_moved():
@@ -1199,7 +1212,13 @@ def test_the_page_of_a_located_dive_shows_the_map(dive):
     page = render_report(compared)
     assert 'id="show-raw" checked' in page
     assert "map that was given" in page
+    assert "Thick lines lead from the given places" in page
     assert "start heading" not in compared.sequence.notes.get("log.sensors", "")
+    again = replace(
+        compared.runs[0], withheld=[f"{LOCATED_AGAIN} after 9.0 s: landmarks"]
+    )
+    told = located_line(replace(compared, runs=[again]))
+    assert told.endswith(f"{LOCATED_AGAIN} after 9.0 s.")
 
 
 def test_the_page_calls_places_that_no_sighting_confirms_refused(dive):

@@ -390,16 +390,14 @@ def print_outcome(comparison: Comparison, place: str) -> None:
 
     Exit with 1 if a run failed, with the reason, and with 3 if sensors contradict each other beyond doubt.
     """
-    from sonar_graph.report import doubtful_lines, failed_lines, summary
+    from sonar_graph.report import doubtful_lines, summary
 
     out = answers()
     out.print(summary(comparison))
     echo(place)
     # results are written all the same: the others may be what was wanted
-    failed = failed_lines(comparison)
-    for line in failed:
-        echo(f"sonar-graph: {line}", err=True)
-    if failed:
+    if failed := [run.estimator for run in comparison.failed_runs]:
+        echo(f"sonar-graph: {', '.join(failed)} failed, for the reason above", err=True)
         raise typer.Exit(1)
     if doubtful_lines(comparison):
         echo(

@@ -481,8 +481,16 @@ class _Replay:
         detections = estimator.detections()
         self._stage = "at the end, outcome checked"
         reasons = "; ".join(withheld_of(estimator))
+        if not self._estimates and reasons:
+            # no fault of the estimator: it says what it lacks
+            return self._result(
+                "failed",
+                reasons,
+                refused=self._refused(estimator),
+                peak_memory_mb=peak_memory_mb,
+            )
         if not self._estimates:
-            raise EvaluationError(reasons or "process never returned an estimate")
+            raise EvaluationError("process never returned an estimate")
         returned(smoothed, Trajectory, "trajectory()")
         if not len(smoothed) and reasons:
             raise EvaluationError(f"it took all its poses back: {reasons}")

@@ -43,8 +43,7 @@ from sonar_graph.live.worker import Answer, LiveOutcome, Worker
 from sonar_graph.logs import ROLES, LiveRecord, wanted_types
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import short_name
-from sonar_graph.models import MOVED
-from sonar_graph.navigation import LOCATED_AGAIN
+from sonar_graph.models import LOCATED_AGAIN, MOVED
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Estimate

@@ -26,6 +26,7 @@ CONTRADICTS = 13.8
 FEWEST = 3
 """Number of contradictions in a row from which on a landmark may have moved."""
 MOVED = "moved since the map was made"
+LOCATED_AGAIN = "located again in the map"
 SURE_TIMES = 3
 """Times as many landmarks contradict the map as agree with it, from which on it, or the start, is wrong beyond doubt."""
 SOON_NS = 5_000_000_000
@@ -117,10 +118,17 @@ class KnownLandmarks:
             and self._contradicting[i] > self._agreeing[i]
         ]
 
+    def _agree(self) -> list[int]:
+        """Landmarks that the map holds by most of their sightings."""
+        return [
+            i
+            for i in self.held.difference(self.moved)
+            if self._agreeing[i] > self._contradicting[i]
+        ]
+
     def _is_outvoted(self, contradicted: list[int]) -> bool:
         """Check that fewer landmarks have moved or are contradicted than agree with the map."""
-        agreeing = (self.held & self.seen).difference(contradicted, self.moved)
-        return len(self.moved) + len(contradicted) < len(agreeing)
+        return len(self.moved) + len(contradicted) < len(self._agree())
 
     def places(self) -> Floats:
         """Places of all landmarks of the map, shape (m, 3), m."""
@@ -178,9 +186,8 @@ class KnownLandmarks:
                 f"{MOVED}: {named(refused)}: their sightings are refused; {way_out}"
             )
         if contradicted:
-            agreeing = (self.held & self.seen).difference(contradicted, moved)
             # a few may agree by chance
-            is_sure = len(contradicted) > max(1, SURE_TIMES * len(agreeing))
+            is_sure = len(contradicted) > max(1, SURE_TIMES * len(self._agree()))
             surely = " beyond doubt" if is_sure else ""
             lines.append(
                 f"{named(contradicted)}: sightings contradict the map{surely}, and too few others agree with it: "

@@ -54,6 +54,7 @@ from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.models import (
     ACCEPTED,
     FEWEST,
+    LOCATED_AGAIN,
     MINIMUM_PROBABILITY,
     elevation_on_floor,
     identify,
@@ -99,7 +100,6 @@ LEAST_RISE = 0.05
 """Rise of the sonar's fan with elevation, beside which it counts as level."""
 WATCHED_S = 120.0
 """Time after the vehicle was located in which a better start replaces a wrong one."""
-LOCATED_AGAIN = "located again in the map"
 NEAR = chi_square_quantile(0.999, 3)
 SAME = 10.0
 """Distance, in sigmas, of starts that are refined to the same one."""

@@ -72,8 +72,6 @@ def summary(comparison: Comparison) -> Group:
         if key in present
     }
     table = Table(
-        title=Text(comparison.sequence.name, style="bold"),
-        title_justify="left",
         box=SIMPLE_HEAD,
         show_edge=False,
         pad_edge=False,
@@ -91,7 +89,9 @@ def summary(comparison: Comparison) -> Group:
             shown = score.text() + MARKS.get(score.verdict, "") if score else ABSENT
             cells.append(Text(shown))
         table.add_row(Text(name), *cells)
-    return Group(table, Text("\n".join(["", *_lines_below(comparison)])))
+    # the title of a table would be folded to the table's width
+    title = Text(comparison.sequence.name, style="bold")
+    return Group(title, table, Text("\n".join(["", *_lines_below(comparison)])))
 
 
 def _lines_below(comparison: Comparison) -> list[str]:
@@ -115,6 +115,7 @@ def _lines_below(comparison: Comparison) -> list[str]:
         sentences.doubt_of_identities,
         sentences.outliers,
         sentences.shared_error,
+        sentences.alike_errors,
         sentences.nameless_landmarks,
     ):
         lines += told(comparison)

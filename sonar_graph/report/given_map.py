@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from sonar_graph.calibration import KnownMap
 from sonar_graph.evaluation import Comparison, RunResult, fixed
+from sonar_graph.models import LOCATED_AGAIN
 from sonar_graph.report import figure_style as style
 from sonar_graph.states import ABSENT, Outcome
 from sonar_graph.table import Table, text_table
@@ -41,7 +43,11 @@ def located_line(comparison: Comparison) -> str:
             continue
         seconds = (run.causal.stamps_ns[0] - sequence.start_ns) * 1e-9
         x, y, _ = run.causal.positions[0].tolist()
-        parts.append(f"{run.estimator}: after {seconds:.1f} s at ({x:.2f}, {y:.2f}) m")
+        part = f"{run.estimator}: after {seconds:.1f} s at ({x:.2f}, {y:.2f}) m"
+        again = [
+            m.partition(":")[0] for m in run.withheld if m.startswith(LOCATED_AGAIN)
+        ]
+        parts.append(", ".join([part, *again]))
     return f"Located in the map: {', '.join(parts)}."
 
 
@@ -59,7 +65,7 @@ def draw_given_map(panel: Axes, comparison: Comparison) -> None:
     row = {landmark_id: k for k, landmark_id in enumerate(known.ids)}
     for index, run in enumerate(comparison.runs):
         own = style.colour(index)
-        for landmark_id in sorted(landmarks_with(run, {Outcome.NEW}) & row.keys()):
+        for landmark_id in mapped_again(run, known):
             found = place_of(run, landmark_id)
             if found is not None:
                 ends = np.array([places[row[landmark_id]], found[:2]])
@@ -68,6 +74,19 @@ def draw_given_map(panel: Axes, comparison: Comparison) -> None:
         if is_found and run.causal:
             first = run.causal.positions[0, :2]
             panel.plot(*first, "*", color=own, markersize=13, zorder=7)
+
+
+def mapped_again(run: RunResult, known: KnownMap) -> list[int]:
+    """Landmarks of the given map that a run took out of it, and initialised again."""
+    return sorted(landmarks_with(run, {Outcome.NEW}).intersection(known.ids))
+
+
+def landmarks_moved(comparison: Comparison) -> bool:
+    """True where a run took landmarks out of the given map, and initialised them again."""
+    known = comparison.sequence.calibration.map
+    return known is not None and any(
+        mapped_again(run, known) for run in comparison.runs
+    )
 
 
 def place_of(run: RunResult, landmark_id: int) -> Any:

@@ -104,7 +104,7 @@ def test_failed_run_is_written_and_reported_by_exit_code(
             tmp_path,
             "--estimators",
             "dead-reckoning,ekf-slam",
-        ).err
+        ).out
     )
     assert "the filter is tired" in (tmp_path / "report.html").read_text()
     runs = json.loads((tmp_path / "comparison.json").read_text())["runs"]

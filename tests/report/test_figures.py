@@ -25,7 +25,7 @@ from sonar_graph.report.figure_style import (
     sized,
 )
 from sonar_graph.report.figures import growth_figure, illustrations, map_figure
-from sonar_graph.report.figures.error_figures import errors_cut_off
+from sonar_graph.report.figures.error_figures import errors_cut_off, shares_in_band
 from sonar_graph.report.figures.maps import (
     ENLARGED,
     LARGEST_ELLIPSE,
@@ -125,6 +125,27 @@ def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     assert corners.y1 == pytest.approx(
         chi2.ppf(0.95, 1) ** 0.5 * errors.position_sigma_m[:, 0].max()
     )
+
+
+def test_the_share_in_the_band_is_that_of_a_chi_square(comparison):
+    """Written beside the figure: 95 % of a chi-square with three and with one degree of freedom, none of a wrong sigma."""
+    series = comparison.errors["isam2"]["causal"]
+    n = 20_000
+    rng = np.random.default_rng(3)
+    drawn = replace(
+        series,
+        stamps_ns=np.arange(n),
+        nees_position=rng.chisquare(series.position_dof, n),
+        nees_yaw=rng.chisquare(1, n),
+    )
+    far = replace(drawn, nees_position=100.0 * drawn.nees_position + 100.0)
+    for shown, share in ((drawn, "95 %"), (far, "0 %")):
+        one = replace(only(comparison, "isam2"), errors={"isam2": {"causal": shown}})
+        assert (
+            shares_in_band(one) == f" In the band (position, yaw): isam2 {share}, 95 %."
+        )
+    caption = illustrations(only(comparison, "isam2"))["nees"].caption
+    assert " In the band (position, yaw): isam2 " in caption
 
 
 def test_a_run_that_is_far_worse_leaves_the_picture_and_is_named(comparison):

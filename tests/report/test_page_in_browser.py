@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 
 from sonar_graph.report import write_batch_report, write_page
 from tests.recorded_batches import LOGS, drawn_batch, with_failures
-from tests.synthetic import basin_comparison
+from tests.synthetic import basin_comparison, with_run
 
 sync_api = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed: pip install playwright"
@@ -59,7 +60,11 @@ def page_of_many_logs(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def comparison_file(tmp_path_factory) -> Path:
-    return write_page(basin_comparison(240), tmp_path_factory.mktemp("comparison"))
+    comparison = basin_comparison(240)
+    first = replace(comparison.runs[0], withheld=["landmark 1: a finding of the run"])
+    return write_page(
+        with_run(comparison, first), tmp_path_factory.mktemp("comparison")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +143,9 @@ def test_the_first_screen_has_sentence_and_map(browser, comparison_file, width, 
         if width == DESKTOP:
             assert page.evaluate(box.format(shown) + ".width") >= 700
             assert page.evaluate(box.format("#table-compact") + ".bottom") <= 800
+            # beside the map, however high that is
+            findings = page.evaluate(box.format(".findings summary") + ".bottom")
+            assert findings < page.evaluate(box.format(shown) + ".bottom")
         assert page.evaluate(SMALLEST_TEXT_PX) >= 12
         assert page.evaluate(VISIBLE_WORDS) <= 1500
         ink, paper = page.evaluate(

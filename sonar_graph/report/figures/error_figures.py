@@ -169,16 +169,10 @@ def yaw_figure(comparison: Comparison) -> Figure | None:
 
 def nees_figure(comparison: Comparison) -> Figure | None:
     """Causal NEES of position and yaw over time per degree of freedom, with the two-sided 95 % chi-square band."""
-    series = {
-        index: errors
-        for index, errors in _causal_errors(comparison).items()
-        if np.isfinite([errors.nees_position, errors.nees_yaw]).any()
-    }
+    series = _with_nees(comparison)
     if not series:
         return None
-    dofs = {"position": next(iter(series.values())).position_dof, "yaw": 1}
-    if not np.isfinite([errors.nees_yaw for errors in series.values()]).any():
-        del dofs["yaw"]
+    dofs = _nees_dofs(series)
     size_in = style.size_in(len(dofs), 2.1)
     figure, axes = style.blank_panels(len(dofs), 1, size_in, sharex=True, sharey=True)
     for panel, (label, dof) in zip(axes[:, 0], dofs.items(), strict=True):
@@ -187,24 +181,53 @@ def nees_figure(comparison: Comparison) -> Figure | None:
         low, high = anees_interval(1, dof, BAND_PROBABILITY)
         panel.axhspan(low, high, color=style.TRUTH, alpha=0.25, linewidth=0)
         panel.axhline(1.0, color=style.MUTED, linewidth=0.7)
-        inside: list[str] = []
         for index, errors in series.items():
             name = comparison.runs[index].estimator
             seconds = style.seconds_since_start(comparison, errors.stamps_ns)
-            nees = (
-                errors.nees_position if label == "position" else errors.nees_yaw
-            ) / dof
-            _draw_nees(panel, seconds, nees, index, name)
-            known = nees[np.isfinite(nees)]
-            if known.size:
-                share = float(np.mean((known >= low) & (known <= high)))
-                inside.append(f"{name}: {100 * share:.0f} % in the band")
-        text = "\n".join(inside)
-        panel.text(0.02, 0.04, text, transform=panel.transAxes, color=style.INK)
+            _draw_nees(panel, seconds, _nees(errors, label) / dof, index, name)
         panel.set_ylabel(f"{label} NEES / dof")
     axes[-1, 0].set_xlabel(style.TIME_LABEL)
     style.legend_above(figure, axes[0, 0])
     return figure
+
+
+def shares_in_band(comparison: Comparison) -> str:
+    """A sentence with the share of instants whose NEES is in the band, by run; empty where there is no NEES."""
+    series = _with_nees(comparison)
+    dofs = _nees_dofs(series) if series else {}
+    parts = []
+    for index, errors in series.items():
+        shares = []
+        for label, dof in dofs.items():
+            low, high = anees_interval(1, dof, BAND_PROBABILITY)
+            nees = _nees(errors, label) / dof
+            known = nees[np.isfinite(nees)]
+            if known.size:
+                share = np.mean((known >= low) & (known <= high))
+                shares.append(f"{100.0 * share:.0f} %")
+        parts.append(f"{comparison.runs[index].estimator} {', '.join(shares)}")
+    return f" In the band ({', '.join(dofs)}): {'; '.join(parts)}." if parts else ""
+
+
+def _with_nees(comparison: Comparison) -> dict[int, ErrorSeries]:
+    """Causal errors with a NEES, by the index of the run."""
+    return {
+        index: errors
+        for index, errors in _causal_errors(comparison).items()
+        if np.isfinite([errors.nees_position, errors.nees_yaw]).any()
+    }
+
+
+def _nees_dofs(series: dict[int, ErrorSeries]) -> dict[str, int]:
+    """Degrees of freedom of the errors that have a NEES."""
+    dofs = {"position": next(iter(series.values())).position_dof, "yaw": 1}
+    if not np.isfinite([errors.nees_yaw for errors in series.values()]).any():
+        del dofs["yaw"]
+    return dofs
+
+
+def _nees(errors: ErrorSeries, label: str) -> Floats:
+    return errors.nees_position if label == "position" else errors.nees_yaw
 
 
 def _causal_errors(comparison: Comparison) -> dict[int, ErrorSeries]:

@@ -31,7 +31,7 @@ from sonar_graph.report.figures.maps import (
     map_figure,
     paths_cut_off,
 )
-from sonar_graph.report.given_map import located_line
+from sonar_graph.report.given_map import landmarks_moved, located_line
 
 ALIGNED = "aligned to the truth"
 
@@ -84,7 +84,7 @@ DRAWINGS = {
         "Consistency over time",
         error_figures.nees_figure,
         "NEES of the causal estimates per degree of freedom, {world}. Dots are instants, lines are means over a "
-        "fortieth of the run. The band holds 95 % of a consistent estimator's values.",
+        "fortieth of the run. The band holds 95 % of a consistent estimator's values.{in_band}",
         "{no_errors} NEES needs them.",
         columns=1,
     ),
@@ -194,12 +194,15 @@ def _captions(comparison: Comparison) -> dict[str, str]:
     landmarks = f" Ellipses hold 95 %{as_large}."
     line = "" if comparison.is_aligned else located_line(comparison)
     located = line.replace("map:", "map (star):", 1)
+    if not comparison.is_aligned and landmarks_moved(comparison):
+        located += " Thick lines lead from the given places of landmarks to those where they are mapped again."
     gone = paths_cut_off(comparison)
     has_yaw = error_figures.has_yaw(comparison)
     in_words = {
         "world": world,
         "and_heading": ", and size of the causal heading's error" * has_yaw,
         "cut": _leaving(error_figures.errors_cut_off(comparison)),
+        "in_band": error_figures.shares_in_band(comparison),
     }
     captions = {
         name: DRAWINGS[name].caption.format(**in_words)
