@@ -405,7 +405,7 @@ def test_landmarks_below_the_aperture_do_not_bend_a_found_start(dive):
     assert locator.found is not None
     _, x, y = locator.found.parameters
     np.testing.assert_allclose([x, y], start.translation()[:2], atol=0.1)
-    assert not any(sighting.is_in_view for sighting in locator.sightings)
+    assert all(sighting.rise_m for sighting in locator.sightings)
 
 
 def test_a_found_start_has_the_height_of_the_depths(dive):
@@ -730,7 +730,7 @@ def groups_in_a_row(known: KnownMap, rng: np.random.Generator) -> list[MapSighti
             drift_m = drift_m + STEP_M * rng.standard_normal(2)
         q = np.array(place[:2]) + drift_m + 0.02 * rng.standard_normal(2)
         S = C[3:5, 3:5] + 0.02**2 * np.eye(2)
-        sightings.append(MapSighting(row, q, S, True, by_place, C))
+        sightings.append(MapSighting(row, q, S, 0.0, by_place, C))
     return sightings
 
 
@@ -939,6 +939,18 @@ def test_a_map_of_which_two_landmarks_are_seen_is_not_called_right(dive):
     assert "fewer than three of its landmarks" in finding.text()
 
 
+@pytest.mark.parametrize("rise_m", [-6.0, -4.0, 4.0])
+def test_heights_from_another_zero_are_named_with_what_to_add(dive, rise_m):
+    known = surveyed(dive)
+    places = np.array(known.positions_m) - [0.0, 0.0, rise_m]
+    mistaken = KnownMap.of(known.ids, places, sigma_m=SIGMA_M)
+    (finding,) = map_findings(with_map(dive, mistaken, unknown_start(dive)))
+    assert finding.acts
+    assert "another zero than the depth" in finding.text()
+    told_m = float(finding.line.split()[1])
+    assert abs(told_m - rise_m) < 0.8
+
+
 @pytest.mark.parametrize("shown", [[1], [1, 2]])
 def test_a_wrong_sign_of_z_is_named_by_one_landmark(dive, shown):
     """By the vertical aperture: at the other side of the surface none of them could be seen."""
@@ -972,6 +984,17 @@ def test_landmarks_that_moved_are_no_exchanged_identities(dive):
     (finding,) = [f for f in map_findings(with_map(dive, moved)) if f.acts]
     assert finding.quantity == "map: landmarks elsewhere"
     assert finding.cause.startswith("1, 2 are seen") or finding.cause.startswith("1..2")
+
+
+def test_a_survey_that_errs_more_than_it_states_is_no_set_of_moved_landmarks(dive):
+    """Errors of 10 cm beside sigmas of 2 cm: a few of twelve landmarks disagree, and moved by chance no farther."""
+    truth = dive.true_landmarks
+    told = []
+    for seed in range(6):
+        errors = 0.1 * np.random.default_rng(seed).standard_normal((len(truth), 3))
+        known = KnownMap.of(truth.ids, truth.positions + errors, sigma_m=0.02)
+        told += [f.text() for f in map_findings(with_map(dive, known)) if f.acts]
+    assert sum("its sigmas are too small" in text for text in told) >= 4
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,17 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         if others := named.difference(known.ids):
             fits += f"; not in it: {listed(others)}"
         yield Finding("map: yaw of the start in it", in_degrees(turn), "°", fits)
+    if fit.rise_m:
+        aperture_deg = np.degrees(right.calibration.sonar.elevation_aperture_rad)
+        yield Finding(
+            "map: heights",
+            unknown("another zero, or another sonar"),
+            cause=f"most landmarks are not within the sonar's vertical aperture of {aperture_deg:.0f}° at their heights "
+            "in the map: these count from another zero than the depth, or the sonar's tilt or aperture is wrong",
+            line=f"add {fit.rise_m:+.1f} m to each z_m of the map; or give `rpy_rad` under [sonar.mounting] or "
+            f"`elevation_aperture_rad` under [sonar] {IN_CALIBRATION}",
+            gravity=Gravity.ACT,
+        )
     if fit.elsewhere:
         yield Finding(
             "map: landmarks elsewhere",

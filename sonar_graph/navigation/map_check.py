@@ -56,6 +56,7 @@ NEGATED = "z_m has the wrong sign; the world's z points up"
 MIRRORED = (
     "it is a mirror image: x_m and y_m are swapped, or one of them has the wrong sign"
 )
+OTHER_ZERO = "its heights count from another zero than the depth"
 NORTH_EAST_DOWN = "the axes are north, east, down; the world's z points up"
 MISTAKES = {
     NEGATED: Z_UP,
@@ -68,6 +69,8 @@ MISTAKES = {
 """Mistake of a map, and the matrix that undoes it."""
 MORE_SHOWN = 0.25
 """Share of the sightings that the vertical aperture allows only with the other sign of the heights."""
+LEAST_SHOWN = 0.5
+"""Share of the sightings that it allows with the right heights, at least: wrong identities and side lobes are fewer."""
 SIGMA_FACTOR = 10.0
 
 
@@ -84,6 +87,8 @@ class MapFit(NamedTuple):
     """False where fewer than `FEWEST` landmarks were seen, and nothing else shows a mistake."""
     elsewhere: tuple[int, ...] = ()
     """Identities of landmarks that stand elsewhere than in the map, seen from the start."""
+    rise_m: float = 0.0
+    """Height by which most landmarks are outside of the sonar's vertical aperture; 0 where they are not."""
 
 
 def map_fit(sequence: Sequence) -> MapFit:
@@ -93,13 +98,14 @@ def map_fit(sequence: Sequence) -> MapFit:
     start = first_start(sequence, known)
     given = followed(sequence, known)
     negated = followed(sequence, undone(known, Z_UP))
-    is_hidden = (
-        len(given.sightings) >= FEWEST_SIGHTINGS
-        and shown(negated) - shown(given) > MORE_SHOWN
-    )
+    are_enough = len(given.sightings) >= FEWEST_SIGHTINGS
+    is_hidden = are_enough and shown(negated) - shown(given) > MORE_SHOWN
+    rise_m = 0.0
+    if are_enough and shown(given) < LEAST_SHOWN:
+        rise_m = float(np.median([sighting.rise_m for sighting in given.sightings]))
     is_checked = len(seen_rows(given)) >= FEWEST
     if not (is_checked or is_hidden):
-        return MapFit(start, is_checked=False)
+        return MapFit(start, is_checked=False, rise_m=rise_m)
     gain = 0.0 if start is None else evidence(negated) - evidence(given)
     if is_hidden or gain > math.log(CLEAR):
         T = MISTAKES[NORTH_EAST_DOWN]
@@ -108,6 +114,10 @@ def map_fit(sequence: Sequence) -> MapFit:
         if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
+    if rise_m:
+        raised = followed(sequence, moved_up(known, rise_m))
+        if evidence(raised) - evidence(given) > math.log(CLEAR):
+            return MapFit(start, OTHER_ZERO, f"add {rise_m:+.1f} m to each z_m")
     moved: list[int] = []
     elsewhere: tuple[int, ...] = ()
     if start is not None:
@@ -142,15 +152,20 @@ def map_fit(sequence: Sequence) -> MapFit:
     swaps = exchanged_identities(given.sightings, known)
     if swaps:
         return MapFit(None, *of_swaps(swaps))
-    if start is not None:
-        return MapFit(start, elsewhere=elsewhere)
     looser = known.model_copy(
         update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
     )
-    if gives_start(sequence, looser):
+    if start is not None:
+        gain = 0.0
+        if elsewhere:
+            # of one that moved the others say that their sigmas are right
+            gain = evidence(followed(sequence, looser)) - evidence(given)
+        if rise_m or gain <= math.log(CLEAR):
+            return MapFit(start, elsewhere=elsewhere, rise_m=rise_m)
+    if not rise_m and gives_start(sequence, looser):
         factor = f"give sigmas up to {SIGMA_FACTOR:g} times as large"
         return MapFit(None, "its sigmas are too small", factor)
-    return MapFit(None)
+    return MapFit(None, rise_m=rise_m)
 
 
 def first_start(sequence: Sequence, known: KnownMap) -> FoundStart | None:
@@ -282,7 +297,7 @@ def agreeing(locator: MapLocator) -> int:
 
 def shown(locator: MapLocator) -> float:
     """Share of the sightings whose landmark is within the sonar's vertical aperture by its height in the map."""
-    return float(np.mean([sighting.is_in_view for sighting in locator.sightings]))
+    return float(np.mean([sighting.rise_m == 0.0 for sighting in locator.sightings]))
 
 
 def gives_start(sequence: Sequence, known: KnownMap) -> bool:
@@ -301,6 +316,13 @@ def undone(known: KnownMap, T: np.ndarray) -> KnownMap:
     places = np.array(known.positions_m) @ T.T
     all_T = np.kron(np.eye(len(places)), T)
     return KnownMap.of(known.ids, places, covariance_m2=all_T @ known.joint() @ all_T.T)
+
+
+def moved_up(known: KnownMap, rise_m: float) -> KnownMap:
+    """The map with all heights raised."""
+    places = np.array(known.positions_m)
+    places[:, 2] += rise_m
+    return KnownMap.of(known.ids, places, covariance_m2=known.joint())
 
 
 def remedy_of(known: KnownMap, T: np.ndarray) -> str:

@@ -96,6 +96,8 @@ NEWS_SHARE = 0.05
 """Share of all sightings that is news together: a map that never fits would be compared with each frame of a long dive."""
 VERTICAL_M_S = 0.5
 """Vertical speed that a depth may have missed since it was measured."""
+HEIGHT_SIGMAS = 3.0
+"""Sigmas of map and vehicle by which a landmark may be outside of the heights that the vertical aperture shows."""
 LEAST_RISE = 0.05
 """Rise of the sonar's fan with elevation, beside which it counts as level."""
 WATCHED_S = 120.0
@@ -117,8 +119,9 @@ class MapSighting(NamedTuple):
     """Place in o, shape (2,), m."""
     S: Floats
     """Its covariance, shape (2, 2), m²."""
-    is_in_view: bool = True
-    """False where the height of the landmark in the map puts it outside of the sonar's vertical aperture."""
+    rise_m: float = 0.0
+    """From the height of the landmark in the map to the middle of the heights that the sonar's vertical aperture shows; 0
+    where it is one of these."""
     by_odometry: Floats = np.zeros((2, 6))
     """Change of q with an error of odometry, which is the same twist in o for all that is seen later, shape (2, 6)."""
     C_odometry: Floats = np.zeros((6, 6))
@@ -332,7 +335,8 @@ class MapLocator:
         by_odometry = o_T_body.inverse().AdjointMap()
         body = self._at_depth(BodyInFrame(o_T_body, C, 0.0, by_odometry), stamp_ns)
         o_T_sonar = body.o_T_body.compose(self._body_T_sonar)
-        half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
+        R = body.o_T_body.rotation().matrix()
+        height_m2 = body.height_m2 + float(R[2] @ body.C[3:, 3:] @ R[2])
         for k in rows:
             row = self._rows[int(ids[k])]
             z = np.array([frame.range_m[k], frame.azimuth_rad[k]])
@@ -350,16 +354,32 @@ class MapLocator:
             of_floor_m2 = self._heights_m2[row] if elevation_rad is not None else 0.0
             S, by_body = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
             # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
-            is_in_view = elevation_rad is not None and abs(elevation_rad) <= half_rad
+            rise_m = self._rise_m(row, o_T_sonar, z, height_m2)
             by_error = by_body @ body.by_odometry
             of_bias = by_error @ o_Ad_body @ by_bias
             self.sightings.append(
-                MapSighting(
-                    row, point[:2], S, is_in_view, by_error, C_odometry, of_bias
-                )
+                MapSighting(row, point[:2], S, rise_m, by_error, C_odometry, of_bias)
             )
             self._times_seen[row] += 1
         return True
+
+    def _rise_m(
+        self, row: int, o_T_sonar: gtsam.Pose3, z: Floats, height_m2: float
+    ) -> float:
+        """`MapSighting.rise_m` of a landmark at this range and azimuth, shape (2,).
+
+        ``height_m2``: variance of the body's height.
+        """
+        half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
+        heights_m = [
+            float(locate(o_T_sonar, float(z[0]), float(z[1]), elevation_rad)[2])
+            for elevation_rad in (-half_rad, half_rad)
+        ]
+        given_m = float(self._places[row, 2])
+        margin_m = HEIGHT_SIGMAS * math.sqrt(self._heights_m2[row] + height_m2)
+        if min(heights_m) - margin_m <= given_m <= max(heights_m) + margin_m:
+            return 0.0
+        return 0.5 * sum(heights_m) - given_m
 
     def _at_depth(self, body: BodyInFrame, stamp_ns: int) -> BodyInFrame:
         """The body at the height of the last depth, where that is better known than by odometry."""
