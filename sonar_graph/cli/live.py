@@ -180,13 +180,16 @@ def live(
     # losses are written down: they decide whether the run can be trusted
     counts = run.counts()
     write_json(output / COUNTS, {"estimator": estimator, "messages": counts})
+    # landmarks may have refuted a place that was found in a map
+    is_lost = not len(outcome.smoothed)
     result = RunResult(
         estimator,
         params or overrides,
-        "ok",
-        causal=outcome.causal,
-        smoothed=outcome.smoothed,
-        landmarks=outcome.landmarks,
+        "failed" if is_lost else "ok",
+        "; ".join(outcome.withheld) if is_lost else "",
+        causal=None if is_lost else outcome.causal,
+        smoothed=None if is_lost else outcome.smoothed,
+        landmarks=None if is_lost else outcome.landmarks,
         refused=outcome.refused,
         withheld=outcome.withheld,
         update_s=np.array(outcome.update_s),
@@ -207,9 +210,13 @@ def live(
     for what in ("lost", "dropped"):
         for name, number in counts[what].items():
             echo(f"{what}: {number} of {name}")
+    if is_lost:
+        echo(f"sonar-graph: {estimator} failed: {result.reason}", err=True)
     echo(
         f"Results: {page}; the same estimates from the record: sonar-graph run {record} -o DIR"
     )
+    if is_lost:
+        raise typer.Exit(1)
 
 
 def with_map(reading: ReadingOptions) -> PartialCalibration | None:

@@ -113,8 +113,8 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         yield Finding(
             "map: landmarks elsewhere",
             unknown("they moved"),
-            cause=f"{listed(fit.elsewhere)} are seen several times in another place than the map has them: moved, or wrong "
-            "lines of the survey",
+            cause=f"{listed(fit.elsewhere)} are seen several times in another place than the map has them: moved, wrong "
+            "lines of the survey, or heights from another zero",
             line="correct these lines of the map, or leave them out",
             gravity=Gravity.ACT,
         )

@@ -226,6 +226,9 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
             "none: the log has no truth, so no trajectory error can be given"
         )
         return comparison
+    if not ended:
+        environment["scored instants"] = "none: no run has a pose"
+        return comparison
     scored = scored_instants(instants_ns, true, runs)
     # a reader of the protocol must see that the truth was moved
     fitted = f"; {unaligned(sequence)}" if FITTED in sequence.notes else ""

@@ -43,7 +43,7 @@ from sonar_graph.live.worker import Answer, LiveOutcome, Worker
 from sonar_graph.logs import ROLES, LiveRecord, wanted_types
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.cdr import short_name
-from sonar_graph.models import LOCATED_AGAIN, MOVED
+from sonar_graph.models import LOCATED_AGAIN, MOVED, NOT_LOCATED
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Estimate
@@ -343,7 +343,14 @@ class LiveRun:
             self._now.landmarks = len(mapped)
         for estimate in answer.estimates:
             self._put("/sonar_graph/pose", self._forms.estimate(estimate))
-        if not answer.estimates:
+        lacking = [each for each in answer.withheld if each.startswith(NOT_LOCATED)]
+        if lacking and "located" in self._told:
+            self._told.discard("located")
+            self._said(f"its place in the map was wrong; {lacking[0]}")
+            # a pose that landmarks refute is none
+            self._predictor.lose()
+            self._now.at = None
+        if lacking or not answer.estimates:
             return
         newest = answer.estimates[-1]
         self._predictor.correct(newest)
@@ -355,7 +362,7 @@ class LiveRun:
             self._put("/sonar_graph/markers", markers)
 
     def _tell_of_map(self, answer: Answer) -> None:
-        """Say once where the vehicle was located in its map, and what moved in it."""
+        """Say where the vehicle was located in its map, and what moved in it."""
         assert self.engine.calibration is not None
         for message in answer.withheld:
             if message.startswith((LOCATED_AGAIN, MOVED)):

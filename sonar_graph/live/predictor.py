@@ -90,6 +90,10 @@ class Predictor:
         self._estimate = estimate
         self._odometry.forget_before(estimate.stamp_ns)
 
+    def lose(self) -> None:
+        """Forget the estimate: the vehicle is nowhere until the next one."""
+        self._estimate = None
+
     @property
     def map_T_odom(self) -> Floats:
         """Correction of the smooth frame by the newest estimate, shape (4, 4)."""

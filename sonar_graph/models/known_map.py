@@ -27,6 +27,7 @@ FEWEST = 3
 """Number of contradictions in a row from which on a landmark may have moved."""
 MOVED = "moved since the map was made"
 LOCATED_AGAIN = "located again in the map"
+NOT_LOCATED = "not yet located in the map"
 SURE_TIMES = 3
 """Times as many landmarks contradict the map as agree with it, from which on it, or the start, is wrong beyond doubt."""
 SOON_NS = 5_000_000_000

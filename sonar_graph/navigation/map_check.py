@@ -71,7 +71,10 @@ MORE_SHOWN = 0.25
 """Share of the sightings that the vertical aperture allows only with the other sign of the heights."""
 LEAST_SHOWN = 0.5
 """Share of the sightings that it allows with the right heights, at least: wrong identities and side lobes are fewer."""
-SIGMA_FACTOR = 10.0
+SIGMA_FACTORS = (10.0, 100.0)
+"""Factors by which sigmas of a map may be too small."""
+WIDEST_M = 0.5
+"""Sigma of landmarks up to which the second one is tried."""
 
 
 class MapFit(NamedTuple):
@@ -120,8 +123,9 @@ def map_fit(sequence: Sequence) -> MapFit:
             return MapFit(start, OTHER_ZERO, f"add {rise_m:+.1f} m to each z_m")
     moved: list[int] = []
     elsewhere: tuple[int, ...] = ()
+    of_each = newest_of_each(given.sightings, MOST_OF_LANDMARK)
     if start is not None:
-        data = map_data(newest_of_each(given.sightings, MOST_OF_LANDMARK), known)
+        data = map_data(of_each, known)
         # odometry has drifted since the first start
         start = refined(start.parameters, data) or start
         moved = moved_landmarks(start, data)
@@ -152,20 +156,35 @@ def map_fit(sequence: Sequence) -> MapFit:
     swaps = exchanged_identities(given.sightings, known)
     if swaps:
         return MapFit(None, *of_swaps(swaps))
-    looser = known.model_copy(
-        update={"covariance_m2": (SIGMA_FACTOR**2 * known.joint()).tolist()}
-    )
     if start is not None:
         gain = 0.0
-        if elsewhere:
-            # of one that moved the others say that their sigmas are right
+        # beside landmarks that moved the others fit
+        if elsewhere and misfits(start, map_data(of_each, known)):
+            looser = with_sigmas(known, SIGMA_FACTORS[0])
             gain = evidence(followed(sequence, looser)) - evidence(given)
         if rise_m or gain <= math.log(CLEAR):
             return MapFit(start, elsewhere=elsewhere, rise_m=rise_m)
-    if not rise_m and gives_start(sequence, looser):
-        factor = f"give sigmas up to {SIGMA_FACTOR:g} times as large"
-        return MapFit(None, "its sigmas are too small", factor)
+    sigma_m = math.sqrt(float(np.median(np.diag(known.joint()))))
+    for factor in () if rise_m else SIGMA_FACTORS:
+        # a map of another place fits too where its sigmas are metres
+        is_wide = factor > SIGMA_FACTORS[0] and factor * sigma_m > WIDEST_M
+        if not is_wide and gives_start(sequence, with_sigmas(known, factor)):
+            remedy = f"give sigmas up to {factor:g} times as large"
+            return MapFit(None, "its sigmas are too small", remedy)
     return MapFit(None, rise_m=rise_m)
+
+
+def with_sigmas(known: KnownMap, factor: float) -> KnownMap:
+    """The map with sigmas so many times as large."""
+    joint = (factor**2 * known.joint()).tolist()
+    return known.model_copy(update={"covariance_m2": joint})
+
+
+def misfits(start: FoundStart, data: MapData) -> bool:
+    """Check that the landmarks that agree with a start err more than stated, by three sigmas of a mean of chi-squares."""
+    seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
+    squared = squared_distances(start, np.isin(seen, [*start.agreeing]), data)
+    return float(squared.mean()) > 2.0 + 3.0 * 2.0 / math.sqrt(len(squared))
 
 
 def first_start(sequence: Sequence, known: KnownMap) -> FoundStart | None:

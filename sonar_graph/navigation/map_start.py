@@ -9,12 +9,12 @@ t of the start are common to all sightings::
 
 Two sightings of different landmarks give psi and t (two-point resection). Every pair proposes a start, refined by least
 squares over the landmarks that agree with it. A landmark agrees where most of its sightings lie within the 99.9 % ellipse
-of (1), and its mean within that of where the others predict it. One with a wrong identity lies anywhere in the area A of
-the map. The evidence of a start h, with the prior of a pose uniform over A and all headings, and its posterior covariance
-Sigma::
+of (1), and its mean within that of where the others predict it. One with a wrong identity lies anywhere in the area A_n
+in which the vehicle has seen landmarks. The evidence of a start h, with the prior of a pose uniform over the area A of the
+map and all headings, and its posterior covariance Sigma::
 
-    E(h) = N(e) prod_agreeing a_i prod_others (b_i / A) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)                (2)
-    E(one) = sum_i a_i / A prod_{j not i} (b_j / A),    E(other) = prod_i (c_i / A)                          (3)
+    E(h) = N(e) prod_agreeing a_i prod_others (b_i / A_n) (2 pi)^(3/2) |Sigma|^(1/2) / (2 pi A)              (2)
+    E(one) = sum_i a_i / A prod_{j not i} (b_j / A_n),    E(other) = c_1 / A prod_{i > 1} (c_i / A_n)        (3)
 
 E(one) is that of a single right identity, E(other) that of a map of another place, which is a priori as probable as this
 one. With w the probability of a wrong identity, ``a = 1 - w, b = w, c = 1`` for a landmark that was seen several times. One
@@ -56,6 +56,7 @@ from sonar_graph.models import (
     FEWEST,
     LOCATED_AGAIN,
     MINIMUM_PROBABILITY,
+    NOT_LOCATED,
     elevation_on_floor,
     identify,
     listed,
@@ -125,9 +126,9 @@ class MapSighting(NamedTuple):
     by_odometry: Floats = np.zeros((2, 6))
     """Change of q with an error of odometry, which is the same twist in o for all that is seen later, shape (2, 6)."""
     C_odometry: Floats = np.zeros((6, 6))
-    """Covariance of that error until this frame, without that by the bias of the gyros, shape (6, 6); S has both."""
-    by_bias: Floats = np.zeros((2, 3))
-    """Change of q with the bias over its sigma, which is the same at all frames, shape (2, 3)."""
+    """Covariance of that error until this frame, without what is the same at all frames, shape (6, 6); S has both."""
+    by_common: Floats = np.zeros((2, 5))
+    """Change of q with what is the same at all frames over its sigma: gyro bias, roll and pitch of the start, (2, 5)."""
 
 
 class FoundStart(NamedTuple):
@@ -328,15 +329,16 @@ class MapLocator:
             stamp_ns,
         )
         by_bias = motion.D_bias * self._calibration.imu.gyro_bias_sigma  # (6, 3)
-        C = motion.covariance + by_bias @ by_bias.T
         o_T_body = o_T_start.compose(motion.i_T_j)
         o_Ad_body = o_T_body.AdjointMap()
-        C_odometry = o_Ad_body @ motion.covariance @ o_Ad_body.T
         by_odometry = o_T_body.inverse().AdjointMap()
+        by_tilt = start_turns(o_T_start, start)
+        common = np.hstack([o_Ad_body @ by_bias, by_tilt])  # twists in o, (6, 5)
+        of_body = by_odometry @ common
+        C = motion.covariance + of_body @ of_body.T
+        C_odometry = o_Ad_body @ motion.covariance @ o_Ad_body.T
         body = self._at_depth(BodyInFrame(o_T_body, C, 0.0, by_odometry), stamp_ns)
         o_T_sonar = body.o_T_body.compose(self._body_T_sonar)
-        R = body.o_T_body.rotation().matrix()
-        height_m2 = body.height_m2 + float(R[2] @ body.C[3:, 3:] @ R[2])
         for k in rows:
             row = self._rows[int(ids[k])]
             z = np.array([frame.range_m[k], frame.azimuth_rad[k]])
@@ -352,34 +354,42 @@ class MapLocator:
             R_z = frame.range_azimuth_cov[k]
             R_z = self._R_z if np.isnan(R_z).any() else R_z
             of_floor_m2 = self._heights_m2[row] if elevation_rad is not None else 0.0
-            S, by_body = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
+            found = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
             # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
-            rise_m = self._rise_m(row, o_T_sonar, z, height_m2)
-            by_error = by_body @ body.by_odometry
-            of_bias = by_error @ o_Ad_body @ by_bias
+            rise_m = self._rise_m(row, o_T_sonar, sight, found.height_m2)
+            by_error = found.by_body @ body.by_odometry
+            by_common = by_error @ common
             self.sightings.append(
-                MapSighting(row, point[:2], S, rise_m, by_error, C_odometry, of_bias)
+                MapSighting(
+                    row, point[:2], found.S, rise_m, by_error, C_odometry, by_common
+                )
             )
             self._times_seen[row] += 1
         return True
 
     def _rise_m(
-        self, row: int, o_T_sonar: gtsam.Pose3, z: Floats, height_m2: float
+        self, row: int, o_T_sonar: gtsam.Pose3, sight: "Ray", height_m2: float
     ) -> float:
-        """`MapSighting.rise_m` of a landmark at this range and azimuth, shape (2,).
-
-        ``height_m2``: variance of the body's height.
-        """
+        """`MapSighting.rise_m` of a landmark; ``height_m2``: variance of the height at which the sonar has it."""
         half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
+        # along the arc of elevations the height is a sine: highest and lowest at its ends, or at the top between them
+        level, upright = (
+            locate(o_T_sonar, sight.range_m, sight.azimuth_rad, elevation_rad)[2]
+            - o_T_sonar.z()
+            for elevation_rad in (0.0, 0.5 * math.pi)
+        )
+        top_rad = math.atan2(upright, level)
+        tops = [top_rad, top_rad - math.pi, top_rad + math.pi]
         heights_m = [
-            float(locate(o_T_sonar, float(z[0]), float(z[1]), elevation_rad)[2])
-            for elevation_rad in (-half_rad, half_rad)
+            float(locate(o_T_sonar, sight.range_m, sight.azimuth_rad, elevation_rad)[2])
+            for elevation_rad in (-half_rad, half_rad, *tops)
+            if abs(elevation_rad) <= half_rad
         ]
         given_m = float(self._places[row, 2])
         margin_m = HEIGHT_SIGMAS * math.sqrt(self._heights_m2[row] + height_m2)
         if min(heights_m) - margin_m <= given_m <= max(heights_m) + margin_m:
             return 0.0
-        return 0.5 * sum(heights_m) - given_m
+        return 0.5 * (min(heights_m) + max(heights_m)) - given_m
 
     def _at_depth(self, body: BodyInFrame, stamp_ns: int) -> BodyInFrame:
         """The body at the height of the last depth, where that is better known than by odometry."""
@@ -464,10 +474,33 @@ class Ray(NamedTuple):
     elevation_rad: float
 
 
+def start_turns(o_T_start: gtsam.Pose3, start: Start) -> Floats:
+    """Twists in o of a start that is rolled, and one that is pitched, by one sigma, shape (6, 2)."""
+    _, pitch, _ = start.rpy_rad
+    sigmas_rad = np.array(start.rpy_sigma_rad[:2])
+    # roll turns about the start's first axis without its roll, pitch about the level axis across
+    axes = gtsam.Rot3.Ry(pitch).matrix()[:, :2]
+    turns = axes * sigmas_rad  # (3, 2)
+    # about the place of the start instead of the origin of o
+    moves = np.cross(o_T_start.translation(), turns, axisb=0, axisc=0)
+    return np.vstack([turns, moves])
+
+
+class Spread(NamedTuple):
+    """Uncertainty of the place of a landmark."""
+
+    S: Floats
+    """Covariance of its level place, shape (2, 2), m²."""
+    by_body: Floats
+    """Change of that place with the body's perturbation, shape (2, 6)."""
+    height_m2: float
+    """Variance of its height at this elevation."""
+
+
 def spread(
     body: BodyInFrame, o_T_sonar: gtsam.Pose3, sight: Ray, R_z: Floats, floor_m2: float
-) -> tuple[Floats, Floats]:
-    """Covariance of the level place of a landmark, shape (2, 2), m², and its change with the body's perturbation, (2, 6).
+) -> Spread:
+    """Uncertainty of the place of a landmark that is seen at the elevation of its height in the map.
 
     ``R_z``: of range and azimuth; ``floor_m2``: variance of its height in the map. Where the body errs in height by h, or
     turns the landmark up by h, the elevation changes until the height is that of the map again.
@@ -482,6 +515,7 @@ def spread(
     by_turn = -R @ cross_matrix(body.o_T_body.transformTo(point))
     by_body = np.hstack([by_turn, R])  # (3, 6)
     cov = by_z @ R_z @ by_z.T  # (3, 3)
+    height_m2 = float((cov + by_body @ body.C @ by_body.T)[2, 2]) + body.height_m2
     cov[2, 2] += MOST_OF_LANDMARK * (body.height_m2 + floor_m2)
     sin_e = math.sin(sight.elevation_rad)
     in_fan = [math.cos(sight.azimuth_rad), math.sin(sight.azimuth_rad)]
@@ -495,7 +529,7 @@ def spread(
     T = np.column_stack([np.eye(2), -by_height])  # (2, 3)
     level_by_body = T @ by_body
     S = T @ cov @ T.T + level_by_body @ body.C @ level_by_body.T
-    return np.asarray(S), np.asarray(level_by_body)
+    return Spread(np.asarray(S), np.asarray(level_by_body), height_m2)
 
 
 def cross_matrix(v: Floats) -> Floats:
@@ -511,10 +545,13 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     if not starts:
         return None
     weights = data.weights
-    log_area = math.log(data.area_m2)
-    all_wrong = float(np.sum(weights.wrong - log_area))
-    one = float(np.logaddexp.reduce(all_wrong + weights.right - weights.wrong))  # (3)
-    of_other_place = float(np.sum(weights.elsewhere - log_area))  # (3)
+    log_near = math.log(data.near_m2)
+    # the first of them lies anywhere in the map, the others near it
+    first = log_near - math.log(data.area_m2)
+    all_wrong = float(np.sum(weights.wrong - log_near))
+    by_one = all_wrong + weights.right - weights.wrong
+    one = float(np.logaddexp.reduce(by_one)) + first  # (3)
+    of_other_place = float(np.sum(weights.elsewhere - log_near)) + first  # (3)
     best = starts[0]
     rivals = [start.log_evidence for start in starts[1:]] + [of_other_place, one]
     weight = float(np.logaddexp.reduce(rivals))
@@ -533,11 +570,12 @@ def map_data(sightings: list[MapSighting], known: KnownMap) -> "MapData":
     rows = np.array([s.row for s in sightings])
     reach_m = float(np.linalg.norm(q, axis=1).max())
     area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
+    near_m2 = min((2.0 * reach_m) ** 2, area_m2)
     is_of = np.unique(rows)[:, None] == rows
     weights = IdentityWeights.of(is_of.sum(axis=1))
     Q = sightings_covariance(sightings)
     S_inv = np.linalg.inv(S)
-    return MapData(q, S, S_inv, Q, rows, is_of, places, M, area_m2, weights)
+    return MapData(q, S, S_inv, Q, rows, is_of, places, M, area_m2, near_m2, weights)
 
 
 def sightings_covariance(sightings: list[MapSighting]) -> Floats:
@@ -549,7 +587,7 @@ def sightings_covariance(sightings: list[MapSighting]) -> Floats:
     H = np.array([s.by_odometry for s in sightings])  # (k, 2, 6)
     C = shared_errors(np.array([s.C_odometry for s in sightings]))  # (k, 6, 6)
     S = np.array([s.S for s in sightings])  # (k, 2, 2)
-    B = np.array([s.by_bias for s in sightings])  # (k, 2, 3)
+    B = np.array([s.by_common for s in sightings])  # (k, 2, 5)
     k = len(sightings)
     earlier_later = np.einsum("kia,lja->kilj", H @ C, H)  # (k, 2, k, 2)
     is_earlier = np.arange(k)[:, None] < np.arange(k)
@@ -638,6 +676,8 @@ class MapData(NamedTuple):
     """Joint covariance of the places, shape (2 m, 2 m)."""
     area_m2: float
     """A."""
+    near_m2: float
+    """A_n."""
     weights: IdentityWeights
 
     @property
@@ -660,7 +700,9 @@ def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
         both = data.Q.reshape(len(data.q), 2, -1, 2)[[k, j]][:, :, [k, j]]
         shared = both[0, :, 1]
         of_seen = both[0, :, 0] + both[1, :, 1] - shared - shared.T
-        cov = of_seen + data.place_cov[a] + data.place_cov[b]
+        # a map that errs as a whole keeps the distances of its landmarks
+        common = data.M[2 * a : 2 * a + 2, 2 * b : 2 * b + 2]
+        cov = of_seen + data.place_cov[a] + data.place_cov[b] - common - common.T
         far_m = float(np.linalg.norm(placed))
         sigma_m = math.sqrt(float(np.trace(cov)))
         if abs(float(np.linalg.norm(seen)) - far_m) > 4.0 * sigma_m or far_m < sigma_m:
@@ -701,7 +743,7 @@ def refined(
             break
         left_out[fitted[worst]] = True
         parameters = fit.parameters
-    wrong = float(np.sum(data.weights.wrong[~fit.agreeing] - math.log(data.area_m2)))
+    wrong = float(np.sum(data.weights.wrong[~fit.agreeing] - math.log(data.near_m2)))
     right = fit.log_density + float(np.sum(data.weights.right[fit.agreeing]))
     log_det = math.log(np.linalg.det(fit.covariance))
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * log_det
@@ -954,7 +996,7 @@ class StartInMap:
     def withheld(self) -> list[str]:
         """Messages of the estimator; before it begins, that the vehicle is not located."""
         if self._inner is None:
-            return [f"not yet located in the map: {self._locator.lacking()}"]
+            return [f"{NOT_LOCATED}: {self._locator.lacking()}"]
         again = [
             f"{LOCATED_AGAIN} after {after_s:.1f} s: landmarks that were seen by then contradict the place before; "
             "causal poses until then are wrong"

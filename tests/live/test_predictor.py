@@ -46,6 +46,20 @@ def test_a_prediction_is_the_next_estimate_of_dead_reckoning():
         )
 
 
+def test_a_vehicle_that_is_lost_has_no_pose_until_the_next_estimate():
+    world = small_world()
+    predictor = Predictor(world.calibration)
+    first, second, third, *_ = world.replay(world.instants(10.0))
+    for step in (first, second, third):
+        predictor.add(step.imu, step.dvl)
+    predictor.correct(Estimate(first.end_ns, gtsam.Pose3(), np.eye(6)))
+    assert predictor.predict() is not None
+    predictor.lose()
+    assert predictor.predict() is None
+    predictor.correct(Estimate(second.end_ns, gtsam.Pose3(), np.eye(6)))
+    assert predictor.predict().stamp_ns == third.end_ns
+
+
 def test_frames_differ_by_the_newest_correction():
     """``world_T_body = map_T_odom odom_T_body``, also after an estimate that jumps; odom moves on smoothly."""
     world = small_world()
