@@ -162,6 +162,7 @@ def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
         for name in ("start roll: value", "start heading: error")
     )
     assert ours == theirs == pytest.approx([ROLL, PITCH, YAW], abs=2e-3)
+    assert found["start roll: value"].gravity is Gravity.ACT
 
 
 def test_a_start_heading_within_its_own_sigma_is_not_wrong():
@@ -169,12 +170,9 @@ def test_a_start_heading_within_its_own_sigma_is_not_wrong():
     assert not found_in(run)["start heading: error"].acts
 
 
-@pytest.mark.parametrize(
-    ("off_rad", "gravity"), [(0.1, Gravity.ACT), (3.0, Gravity.GRAVE)]
-)
-def test_a_start_on_its_back_makes_results_doubtful(off_rad, gravity):
-    found = found_in(started_at(ROLL + off_rad, PITCH, YAW))
-    assert found["start roll: value"].gravity is gravity
+def test_a_start_on_its_back_makes_results_doubtful():
+    found = found_in(started_at(ROLL + 3.0, PITCH, YAW))
+    assert found["start roll: value"].gravity is Gravity.GRAVE
 
 
 def test_a_number_that_cannot_be_told_asks_for_nothing():
@@ -207,15 +205,14 @@ def test_a_hole_of_the_imu_asks_for_nothing(
     assert found_in(run)[of_reference].acts == (hole_s > 2.0)
 
 
-@pytest.mark.parametrize(
-    ("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)]
-)
+@pytest.mark.parametrize(("speed_m_s", "is_told"), [(0.05, True), (0.8, False)])
 def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told: bool):
     rng = np.random.default_rng(0)
     force = 0.05 * rng.standard_normal((5000, 3))
     rate = 0.01 * rng.standard_normal((5000, 3))
     velocity = [speed_m_s, 0, 0] + 0.01 * rng.standard_normal((250, 3))
-    found = found_in(with_rows(rate, force, velocity))
+    run = with_rows(rate, force, velocity)
+    found = by_name(list(sensor_check.noise_findings(run)))
     for name in ("gyro noise density", "accelerometer noise density"):
         assert found[name].estimate.is_known == found[name].acts == is_told
         assert is_told or "steady, but at 0.8 m/s" in found[name].text()
@@ -409,18 +406,15 @@ def test_values_in_steps_far_above_their_noise_are_named_alone() -> None:
     assert coarse_findings(RIGHT) == []
 
 
-@pytest.mark.parametrize(
-    ("is_wrong", "is_placed"), [(True, True), (True, False), (False, False)]
-)
+@pytest.mark.parametrize("is_wrong", [True, False])
 def test_a_mounting_that_is_not_known_is_named_before_what_may_follow_from_it(
-    is_wrong: bool, is_placed: bool
+    is_wrong: bool,
 ) -> None:
     signs = [1.0, -1.0, -1.0] if is_wrong else 1.0
     run = spoilt(RIGHT, "dvl", velocity=signs * RIGHT.dvl.velocity)
-    notes = {} if is_placed else {"log.warnings": unplaced("dvl", "x", has_tree=True)}
+    notes = {"log.warnings": unplaced("dvl", "x", has_tree=True)}
     found = names(grave(replace(run, notes=notes)))
-    assert bool(found) == is_wrong
-    assert ("mountings" in found[:1]) == (is_wrong and not is_placed)
+    assert found[:1] == ["mountings"] * is_wrong
 
 
 @pytest.mark.parametrize("drift", [0.003, 0.03])

