@@ -129,7 +129,8 @@ def test_fixes_faster_than_any_vehicle_are_found_and_outliers_are_not(every_s: f
     for right in (places, spikes):
         found = position_findings(spoilt(good, "positions", position_m=right))
         assert jumps not in names(found)
-    assert jumps in names(acting(spoilt(good, "positions", position_m=angles)))
+    found = position_findings(spoilt(good, "positions", position_m=angles))
+    assert jumps in [finding.quantity for finding in found if finding.acts]
 
 
 @pytest.mark.parametrize(
@@ -277,10 +278,16 @@ def test_a_delay_of_the_sonar_is_found_by_the_turns_between_sightings(late_s: fl
         assert line_of(delay)["stamp_offset_s"] == pytest.approx(-late_s, abs=0.1)
 
 
+def acting_of_ranges(run: Sequence) -> list[Finding]:
+    match = aiding_check.RANGE.compare(run, BodyMotion.of(run))
+    found = aiding_check.findings_of(aiding_check.RANGE, match, run, NO_CONFIG)
+    return [finding for finding in found if finding.acts]
+
+
 @pytest.mark.parametrize("turn_rad", [0.0, -0.6])
 def test_a_turned_sonar_is_named_with_the_mounting_that_puts_it_right(turn_rad: float):
     azimuth_rad = SEEN.detections.azimuth_rad + turn_rad
-    found = acting(spoilt(SEEN, "detections", azimuth_rad=azimuth_rad))
+    found = acting_of_ranges(spoilt(SEEN, "detections", azimuth_rad=azimuth_rad))
     of_sonar = "ranges to landmarks: turn of the sonar"
     assert names(found)[:1] == [of_sonar] * (turn_rad != 0)
     if turn_rad:
@@ -295,7 +302,7 @@ def test_a_gap_of_the_doppler_log_hides_no_turn_of_the_sonar():
     turned = spoilt(SEEN, "detections", azimuth_rad=azimuth_rad)
     t = (turned.dvl.stamps_ns - turned.start_ns) * 1e-9
     with_gap = replace(turned, dvl=turned.dvl.rows((t < 50.0) | (t > 55.0)))
-    (found,) = acting(with_gap)
+    (found,) = acting_of_ranges(with_gap)
     assert found.quantity == "ranges to landmarks: turn of the sonar"
 
 
@@ -303,7 +310,9 @@ def test_fixes_without_a_height_are_compared_in_the_level_alone():
     run = fixed(SEEN, sigma_m=0.3)
     cov = np.diag([0.09, 0.09, UNMEASURED_M2])
     covs = np.tile(cov, (len(run.positions), 1, 1))
-    assert not acting(spoilt(run, "positions", covariance_m2=covs))
+    run = spoilt(run, "positions", covariance_m2=covs)
+    of_height = list(aiding_check.fix_height_findings(run, NO_CONFIG))
+    assert not [f for f in (*position_findings(run), *of_height) if f.acts]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.diagnosis import Finding, sensor_check
+from sonar_graph.diagnosis import Finding, check_sensors, sensor_check
 from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_units
@@ -22,7 +22,6 @@ from .runs import (
     acting,
     by_name,
     dvl_rows,
-    grave,
     heading_rows,
     late,
     line_of,
@@ -137,6 +136,12 @@ def test_corrections_add_to_those_of_the_configuration():
     assert (finding.quantity, line_of(finding)) == ("DVL: unit", {"scale": 0.002})
 
 
+def of_reference(run: Sequence) -> dict[str, Finding]:
+    """Findings about the reference and the start alone."""
+    tilt = find_start_tilt(run)
+    return by_name(list(sensor_check.reference_findings(run, LogConfig(), tilt)))
+
+
 def started_at(*rpy_rad: float, yaw_sigma_rad: float = 0.001) -> Sequence:
     sigmas = (*RIGHT.calibration.start.rpy_sigma_rad[:2], yaw_sigma_rad)
     return recalibrated(RIGHT, "start", rpy_rad=rpy_rad, rpy_sigma_rad=sigmas)
@@ -149,7 +154,7 @@ def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one(late_s)
     run = replace(late(RIGHT, "truth", late_s), imu=RIGHT.imu.rows(is_left))
     begun = run.truth.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0]
     run = recalibrated(run, "start", rpy_rad=tuple(begun[::-1].tolist()))
-    finding = found_in(run)["start heading: error"]
+    finding = of_reference(run)["start heading: error"]
     assert finding.acts == (late_s > 0), finding.text()
     told = "(--calibration FILE); the position too is the reference's"
     assert (told in finding.advice) == finding.acts
@@ -167,11 +172,11 @@ def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
 
 def test_a_start_heading_within_its_own_sigma_is_not_wrong():
     run = started_at(ROLL, PITCH, YAW + 0.1, yaw_sigma_rad=0.1)
-    assert not found_in(run)["start heading: error"].acts
+    assert not of_reference(run)["start heading: error"].acts
 
 
 def test_a_start_on_its_back_makes_results_doubtful():
-    found = found_in(started_at(ROLL + 3.0, PITCH, YAW))
+    found = of_reference(started_at(ROLL + 3.0, PITCH, YAW))
     assert found["start roll: value"].gravity is Gravity.GRAVE
 
 
@@ -406,15 +411,14 @@ def test_values_in_steps_far_above_their_noise_are_named_alone() -> None:
     assert coarse_findings(RIGHT) == []
 
 
-@pytest.mark.parametrize("is_wrong", [True, False])
-def test_a_mounting_that_is_not_known_is_named_before_what_may_follow_from_it(
-    is_wrong: bool,
-) -> None:
-    signs = [1.0, -1.0, -1.0] if is_wrong else 1.0
-    run = spoilt(RIGHT, "dvl", velocity=signs * RIGHT.dvl.velocity)
+def test_a_mounting_that_is_not_known_is_named_before_what_may_follow() -> None:
+    """Only where something is grave."""
+    run = spoilt(RIGHT, "dvl", velocity=[1.0, -1.0, -1.0] * RIGHT.dvl.velocity)
     notes = {"log.warnings": unplaced("dvl", "x", has_tree=True)}
-    found = names(grave(replace(run, notes=notes)))
-    assert found[:1] == ["mountings"] * is_wrong
+    found = check_sensors(replace(run, notes=notes))
+    assert found[0].quantity == "mountings"
+    harmless = [finding for finding in found if not finding.grave]
+    assert not list(sensor_check.unplaced_findings(replace(run, notes=notes), harmless))
 
 
 @pytest.mark.parametrize("drift", [0.003, 0.03])
