@@ -310,7 +310,8 @@ def test_fixes_without_a_height_are_compared_in_the_level_alone():
     run = fixed(SEEN, sigma_m=0.3)
     cov = np.diag([0.09, 0.09, UNMEASURED_M2])
     covs = np.tile(cov, (len(run.positions), 1, 1))
-    run = spoilt(run, "positions", covariance_m2=covs)
+    places = run.positions.position_m + np.array([0.0, 0.0, 40.0])
+    run = spoilt(run, "positions", position_m=places, covariance_m2=covs)
     of_height = list(aiding_check.fix_height_findings(run, NO_CONFIG))
     assert not [f for f in (*position_findings(run), *of_height) if f.acts]
 

@@ -62,5 +62,5 @@ def test_the_yaw_sigma_of_a_start_makes_the_places_of_landmarks_unsure(
 
 
 def test_a_start_that_defines_the_world_contradicts_nothing():
-    anywhere = Start(position_m=(0.0, 0.0, PLACE[2]), source="vehicle")
+    anywhere = Start(position_m=(20.0, 0.0, PLACE[2]), source="vehicle")
     assert of_place(started(UNKNOWN, anywhere)) == []

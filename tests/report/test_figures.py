@@ -25,7 +25,12 @@ from sonar_graph.report.figure_style import (
     logarithmic,
     sized,
 )
-from sonar_graph.report.figures import drawings, growth_figure, map_figure
+from sonar_graph.report.figures import (
+    drawings,
+    growth_figure,
+    illustrations,
+    map_figure,
+)
 from sonar_graph.report.figures.error_figures import errors_cut_off, shares_in_band
 from sonar_graph.report.figures.maps import (
     ENLARGED,
@@ -306,10 +311,11 @@ def test_ellipses_are_as_large_as_the_figure_has_room_for(number, is_just_too_la
     assert enlargement(replace(comparison, runs=runs)) == expected
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_without_maps_on_the_way_the_page_says_so():
     comparison = basin_comparison(60)
     assert growth_figure(comparison) is None
-    assert drawing_of(comparison, "growth").instead
+    assert illustrations(only(comparison, "isam2"))["growth"].instead
     figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
     assert len(figure.axes) == 3
 
