@@ -62,7 +62,7 @@ def spoilt_log() -> Sequence:
     return with_mounting(run, "imu", translation_m=FAR_M)
 
 
-CORRECTED = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
+CORRECTED = LogConfig.parse({"dvl": {"stamp_offset_s": -1.0, "scale": 2.0}}, "x")
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +84,9 @@ def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]
         if "`" in finding.advice:
             assert " FILE)" in finding.advice or "`--start`" in finding.advice
     shift, scale, yaw = (line_of(found[name]) for name in OF_DVL)
-    assert shift["stamp_offset_s"] == pytest.approx(OFFSET_S - 0.1, abs=0.15)
+    assert shift["stamp_offset_s"] == pytest.approx(OFFSET_S - 1.0, abs=0.15)
     assert scale["scale"] == pytest.approx(2 * SCALE, abs=0.05)
-    run = late(spoilt_log(), "dvl", shift["stamp_offset_s"] + 0.1)
+    run = late(spoilt_log(), "dvl", shift["stamp_offset_s"] + 1.0)
     run = spoilt(run, "dvl", velocity=scale["scale"] / 2.0 * run.dvl.velocity)
     run = with_mounting(run, "dvl", **yaw["dvl"]["mounting"])
     again = found_in(
