@@ -35,7 +35,7 @@ class SourceFiles:
         ]
         self._modules = {self._name(path): path for path in files}
         self._listed: dict[str, dict[str, str]] = {}
-        self._trees = {path: ast.parse(path.read_text("utf-8")) for path in files}
+        self.trees = {path: ast.parse(path.read_text("utf-8")) for path in files}
 
     @cached_property
     def imports(self) -> Graph:
@@ -62,7 +62,7 @@ class SourceFiles:
     def _imported(self, module: str, *, is_typing: bool) -> list[Import]:
         """Imports of a module; ``is_typing``: also those under ``if TYPE_CHECKING``."""
         found: list[Import] = []
-        for node in statements(self._trees[self._modules[module]], is_typing=is_typing):
+        for node in statements(self.trees[self._modules[module]], is_typing=is_typing):
             if isinstance(node, ast.Import):
                 found += [Import(alias.name, None) for alias in node.names]
             elif isinstance(node, ast.ImportFrom):

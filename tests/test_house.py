@@ -39,12 +39,17 @@ def module_name(path: Path) -> str:
 MODULES = {module_name(path): path for path in FILES}
 
 
-def imports_past_a_table_of_contents(path: Path) -> list[str]:
+@pytest.fixture(scope="module")
+def source() -> SourceFiles:
+    return SourceFiles(ROOT, PACKAGES)
+
+
+def imports_past_a_table_of_contents(path: Path, tree: ast.Module) -> list[str]:
     """Modules of a package that are imported from outside of it, instead of the package."""
     own = f"{module_name(path)}."
     imported = [
         node.module
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        for node in ast.walk(tree)
         if isinstance(node, ast.ImportFrom) and node.module in MODULES
     ]
     return [
@@ -56,9 +61,12 @@ def imports_past_a_table_of_contents(path: Path) -> list[str]:
     ]
 
 
-def test_nobody_imports_past_the_table_of_contents_of_a_package() -> None:
+def test_nobody_imports_past_the_table_of_contents_of_a_package(
+    source: SourceFiles,
+) -> None:
     found = {
-        module_name(path): imports_past_a_table_of_contents(path) for path in FILES
+        module_name(path): imports_past_a_table_of_contents(path, tree)
+        for path, tree in source.trees.items()
     }
     assert {name: past for name, past in found.items() if past} == {}
 
@@ -79,11 +87,6 @@ KNOWN_MUTUAL_FOLDERS = {
     ("sonar_graph/simulation", "sonar_graph/simulation/sonar_image"),
     ("sonar_graph/slam", "sonar_graph/slam/landmarks"),
 }
-
-
-@pytest.fixture(scope="module")
-def source() -> SourceFiles:
-    return SourceFiles(ROOT, PACKAGES)
 
 
 def test_no_files_import_each_other_in_a_circle(source: SourceFiles) -> None:
@@ -114,12 +117,12 @@ def test_no_further_folders_import_each_other(source: SourceFiles) -> None:
     )
 
 
-def test_names_of_files_and_of_public_classes_occur_once() -> None:
+def test_names_of_files_and_of_public_classes_occur_once(source: SourceFiles) -> None:
     stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
     classes = Counter(
         node.name
-        for path in FILES
-        for node in ast.parse(path.read_text("utf-8")).body
+        for tree in source.trees.values()
+        for node in tree.body
         if isinstance(node, ast.ClassDef)
     )
     assert [name for name, count in (stems + classes).items() if count > 1] == []

@@ -98,7 +98,6 @@ def test_a_terminal_shows_what_is_compiled_in_place_and_nothing_stays(loops):
 def test_the_cache_goes_where_numba_is_told_and_needs_no_compiler(loops):
     told(loops, NUMBA_CACHE_DIR=str(loops / "elsewhere"))
     assert list((loops / "elsewhere").rglob("*.nbi"))
-    assert told(loops, NUMBA_CACHE_DIR=str(loops / "elsewhere")) == ""
     assert told(loops, NUMBA_DISABLE_JIT="1") == ""
     assert not list(loops.glob("__pycache__/*.nbi"))
 

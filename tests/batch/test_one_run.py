@@ -24,8 +24,10 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
     BasinOptions,
     LandmarkOptions,
+    MissionOptions,
     add_landmarks,
     simulate_basin,
+    simulate_mission,
 )
 
 
@@ -93,10 +95,10 @@ def test_failed_logs_and_estimators_are_rows_with_a_reason(
 
 def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeypatch):
     """A process that has the old sequence in hand gets a run that was planned with the new file."""
-    log = log_with_duration(tmp_path, monkeypatch, 120)
+    log = log_with_duration(tmp_path, monkeypatch, 20)
     planned_short = of_log(planned(), log)
     short = perform(planned_short, tmp_path / "short")
-    log.write_text("150")
+    log.write_text("30")
     long = perform(of_log(planned(), log), tmp_path / "long")
     assert long["scored_instants"] > short["scored_instants"] > 0
     with pytest.raises(
@@ -108,7 +110,7 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
 
     def read_and_changed(*given: Any) -> Sequence:
         sequence = read(*given)
-        log.write_text("120")
+        log.write_text("20")
         return sequence
 
     monkeypatch.setattr(one_run, "read_source", read_and_changed)
@@ -116,15 +118,17 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
         perform(run, tmp_path / "run")
 
 
+def mission(duration_s: int) -> Sequence:
+    return simulate_mission(MissionOptions(duration_s=duration_s))
+
+
 def log_with_duration(
     folder: Path, monkeypatch: pytest.MonkeyPatch, duration_s: int
 ) -> Path:
-    """A file with a number in it, which is read as a simulated basin that lasts so long."""
+    """A file with a number in it, which is read as a simulated mission that lasts so long."""
 
     def read(options: LogOptions) -> Sequence:
-        return simulate_basin(
-            BasinOptions(duration_s=int(Path(options.log).read_text()), laps=1)
-        )
+        return mission(int(Path(options.log).read_text()))
 
     monkeypatch.setitem(KINDS, "mcap", SourceKind(LogOptions, read))
     log = folder / "dive.mcap"
@@ -133,10 +137,9 @@ def log_with_duration(
 
 
 def test_landmarks_on_a_log_are_those_of_the_seed(tmp_path, monkeypatch):
-    log = log_with_duration(tmp_path, monkeypatch, 120)
+    log = log_with_duration(tmp_path, monkeypatch, 60)
     found, other = (read_source(LOG, {"log": str(log)}, seed, {}) for seed in (1, 0))
-    recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
-    expected = add_landmarks(recorded, LandmarkOptions(seed=1))
+    expected = add_landmarks(mission(60), LandmarkOptions(seed=1))
     assert map_of(found) == map_of(expected) != map_of(other)
 
 

@@ -3,12 +3,13 @@
 import pytest
 
 from sonar_graph.report import write_report
-from tests.synthetic import basin_comparison
+from tests.synthetic import basin_comparison, only
 
 
 @pytest.mark.usefixtures("unrendered")
 def test_figures_go_into_a_folder_beside_the_result_or_elsewhere(tmp_path, reply):
-    result = write_report(basin_comparison(60), tmp_path / "result").parent
+    comparison = only(basin_comparison(60), "dead-reckoning")
+    result = write_report(comparison, tmp_path / "result").parent
     assert (
         reply(0, "figures", result).out
         == f"Figures and tables: {result / 'paper' / 'protocol.txt'}\n"

@@ -16,7 +16,7 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 def log(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("inspect") / "mission.mcap"
     write_log(
-        path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2))
+        path, simulate_mission(MissionOptions(seed=6, duration_s=80, landmarks=2))
     )
     return path
 

@@ -76,6 +76,19 @@ def test_images_are_moved_to_the_clock_of_the_navigation(lane, both, tmp_path, r
 
 
 @pytest.fixture(scope="module")
+def few(lane, tmp_path_factory) -> Path:
+    """Too few images to measure an offset by."""
+    first = slice(0, 12)
+    frames = replace(
+        lane.frames,
+        stamps_ns=lane.frames.stamps_ns[first],
+        intensity=lane.frames.intensity[first],
+    )
+    log = tmp_path_factory.mktemp("few") / "images.mcap"
+    return images_log(replace(lane, frames=frames), log)
+
+
+@pytest.fixture(scope="module")
 def bare(lane, tmp_path_factory) -> Path:
     """Navigation as another program writes it: mountings in ``/tf_static``, and no record of this package."""
     folder = tmp_path_factory.mktemp("bare")
@@ -84,12 +97,12 @@ def bare(lane, tmp_path_factory) -> Path:
 
 
 def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
-    lane, both, bare, run, tmp_path
+    lane, few, bare, run, tmp_path
 ):
     out = tmp_path / "joined.mcap"
     expected = lane.sequence.calibration.sonar.mounting
     assert expected != Mounting()
-    assert run("join", both[0], bare, "-o", out, "--offset", OFFSET_S) == 0
+    assert run("join", few, bare, "-o", out, "--offset", OFFSET_S) == 0
     joined = read_log(out)
     sonar = joined.calibration.sonar
     for name in ("translation_m", "rpy_rad"):
@@ -100,7 +113,7 @@ def test_the_mounting_of_the_sonar_is_that_of_the_navigations_frames(
 
 
 def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
-    both, bare, run, tmp_path
+    both, few, bare, run, tmp_path
 ):
     given = tmp_path / "vehicle.toml"
     out = tmp_path / "joined.mcap"
@@ -110,7 +123,7 @@ def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
     )
     words = "-o", out, "--offset", OFFSET_S, "--calibration", given
     for navigation in (bare, both[1]):
-        assert run("join", both[0], navigation, *words) == 0
+        assert run("join", few, navigation, *words) == 0
         found = read_log(out).calibration
         assert found.floor == FloorPrior(z_m=-3.0, sigma_m=0.02)
         assert found.start.position_m == (1.0, 2.0, -0.5)

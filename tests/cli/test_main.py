@@ -41,9 +41,17 @@ def test_help_loads_nothing_heavy(run, dive, tmp_path):
     cache = tmp_path / "cache"
     park = ["convert", "dataset", "victoria-park", "-o", str(tmp_path / "park.mcap")]
     report = ["report", str(tmp_path)]
-    for arguments, unused in ((["--help"], heavy), (park, {"numba"}), (report, set())):
+    module = "importlib.import_module('sonar_graph.report.figures.illustrations')"
+    unrendered = f"import importlib; {module}.inline_svg = lambda *_: '<svg></svg>'"
+    for arguments, unused, before in (
+        (["--help"], heavy, ""),
+        (park, {"numba"}, ""),
+        (report, set(), unrendered),
+    ):
         at_exit = f"lambda: print(sorted({unused} & set(sys.modules)), file=sys.stderr)"
-        code = f"import atexit, sys, sonar_graph.cli; atexit.register({at_exit}); sonar_graph.cli.main({arguments})"
+        imports = "import atexit, sys, sonar_graph.cli"
+        main = f"sonar_graph.cli.main({arguments})"
+        code = "; ".join([f"{before}\n{imports}", f"atexit.register({at_exit})", main])
         env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
         done = subprocess.run(
             [sys.executable, "-c", code],

@@ -3,7 +3,11 @@
 import json
 import re
 from collections import Counter
+from contextlib import redirect_stdout
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -26,12 +30,32 @@ shapes = [{ level_db = 12.0, circle_m = [0.0, 0.0, 0.15] }]
 """
 
 
+class Recognised(NamedTuple):
+    """The log with what was recognised in it, and what the command printed."""
+
+    log: Path
+    said: str
+
+
 @pytest.fixture(scope="module")
-def recognised(lane_log, run, tmp_path_factory):
-    """The log with what was recognised in it."""
+def command(lane_log, run, tmp_path_factory) -> Recognised:
     out = tmp_path_factory.mktemp("recognised") / "out.mcap"
-    assert run("recognise", lane_log, "-o", out) == 0
-    return out
+    said = StringIO()
+    with redirect_stdout(said):
+        assert run("recognise", lane_log, "-o", out) == 0
+    return Recognised(out, said.getvalue())
+
+
+@pytest.fixture(scope="module")
+def recognised(command) -> Path:
+    return command.log
+
+
+@pytest.fixture(scope="module")
+def short_log(lane, tmp_path_factory) -> Path:
+    """The first landmarks of the lane."""
+    log = tmp_path_factory.mktemp("short") / "short.mcap"
+    return lane.write(log, map(lane.one, range(60)))
 
 
 def contents(path: Path) -> Counter[tuple[str, int, bytes]]:
@@ -56,10 +80,8 @@ def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(
     np.testing.assert_array_equal(found.most_probable()[0], expected.most_probable()[0])
 
 
-def test_recognise_says_what_became_of_everything(
-    lane, lane_log, lane_recognition, tmp_path, reply
-):
-    said = reply(0, "recognise", lane_log, "-o", tmp_path / "out.mcap").out
+def test_recognise_says_what_became_of_everything(lane, lane_recognition, command):
+    said = command.said
     assert (
         f"{len(lane.frames)} frames, {len(lane_recognition.detections)} detections"
         in said
@@ -189,17 +211,17 @@ def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(
     )
 
 
-def test_designs_of_ones_own_and_settings_need_no_code(lane_log, run, tmp_path, reply):
+def test_designs_of_ones_own_and_settings_need_no_code(short_log, run, tmp_path, reply):
     (tmp_path / "mine.toml").write_text(DESIGNS)
     words = "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml"
     unknown = "Warning: the log has landmarks 1, 2, 3, of which there is no design"
-    assert unknown in reply(0, "recognise", lane_log, *words).out
+    assert unknown in reply(0, "recognise", short_log, *words).out
     found = read_log(tmp_path / "out.mcap").detections
     assert np.unique(found.candidate_ids).tolist() == [4]
     assert (
         run(
             "recognise",
-            lane_log,
+            short_log,
             "-o",
             tmp_path / "none.mcap",
             "--set",
@@ -215,8 +237,11 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(
 ):
     log = tmp_path / "sonar.mcap"
     out = tmp_path / "out.mcap"
+    frames = lane.frames
+    stamps_ns = frames.stamps_ns[:60]
+    first = replace(frames, stamps_ns=stamps_ns, intensity=frames.intensity[:60])
     with recording(log, {}) as writer:
-        writer.write([sonar_image_messages(TOPIC, lane.frames)])
+        writer.write([sonar_image_messages(TOPIC, first)])
     words = "recognise", log, "-o", out
     lacking = "no IMU and no DVL in the log; leave --motion out"
     assert lacking in reply(2, *words, "--motion", "navigation").err
@@ -252,18 +277,18 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(
 
 
 def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(
-    lane_log, tmp_path, reply
+    short_log, tmp_path, reply
 ):
     page = tmp_path / "page.html"
     out = tmp_path / "out.mcap"
     page.write_text("mine")
     assert (
         "page.html: exists, and sonar-graph did not write it"
-        in reply(2, "recognise", lane_log, "-o", out, "--report", page).err
+        in reply(2, "recognise", short_log, "-o", out, "--report", page).err
     )
     for more in (("--overwrite",), ()):
         assert (
             f"Page: {page}"
-            in reply(0, "recognise", lane_log, "-o", out, "--report", page, *more).out
+            in reply(0, "recognise", short_log, "-o", out, "--report", page, *more).out
         )
         assert 'id="track-0"' in page.read_text()

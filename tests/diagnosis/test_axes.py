@@ -30,7 +30,7 @@ from .runs import (
 )
 from .test_turn_rate import level_drive
 
-WORLD = simulate_mission(MissionOptions(duration_s=90.0, landmarks=1))
+WORLD = simulate_mission(MissionOptions(duration_s=60.0, landmarks=1))
 MOUNTED = Mounting(rpy_rad=(0.3, -0.2, 1.0))
 IDENTITY = np.eye(3)
 UP = np.array([0.0, 0.0, 1.0])
@@ -54,7 +54,7 @@ def found_axes(run: Sequence) -> tuple[list[list[float]], list[list[float]]]:
     return found.gyro.tolist(), found.dvl.tolist()
 
 
-@pytest.mark.parametrize("k", range(48))
+@pytest.mark.parametrize("k", range(0, 48, 5))
 def test_every_axis_and_sign_of_the_gyros_is_found(k: int) -> None:
     G = signed_permutations()[k]
     assert found_axes(with_axes(G, IDENTITY)) == (G.tolist(), IDENTITY.tolist())
@@ -103,7 +103,7 @@ def test_gravity_over_a_gap_in_a_slow_doppler_log_is_no_change_of_velocity() -> 
     assert dvl[0] == [-1.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_way_straight_up_and_down_is_none_in_axes_of_the_world(seed: int) -> None:
     """A vehicle that pitches, whose level velocities are hardly more than their noise."""
     rng = np.random.default_rng(seed)
@@ -131,21 +131,18 @@ def test_without_accelerometers_or_motion_nothing_is_known() -> None:
         assert match_axes(run.imu, run.dvl, run.calibration) is None
 
 
-@pytest.mark.parametrize("given", [("x", "y", "z"), ("x", "-y", "z")])
-def test_a_negated_gyro_yaw_is_the_first_finding_with_its_line(
-    given: tuple[str, str, str],
-) -> None:
+def test_a_negated_gyro_yaw_is_the_first_finding_with_its_line() -> None:
     """The line replaces that of the configuration."""
     rate = WORLD.imu.angular_velocity * [1.0, 1.0, -1.0]
     run = spoilt(WORLD, "imu", angular_velocity=rate)
-    table = {"imu": {"angular_velocity_axes": list(given)}}
+    table = {"imu": {"angular_velocity_axes": ["x", "-y", "z"]}}
     (finding,) = acting(run, LogConfig.parse(table, "x"))
     assert finding.quantity == "gyro axes"
     assert finding.grave
-    assert line_of(finding) == {"angular_velocity_axes": [*given[:2], "-z"]}
+    assert line_of(finding) == {"angular_velocity_axes": ["x", "-y", "-z"]}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_negated_gyro_yaw_is_named_where_most_of_a_log_is_a_rest(seed: int) -> None:
     """Velocities in axes of the world fit such turns better than those of the body, but not as well as right turns."""
     t = np.arange(0.0, 60.0, 0.02)
@@ -157,13 +154,10 @@ def test_a_negated_gyro_yaw_is_named_where_most_of_a_log_is_a_rest(seed: int) ->
     assert finding.quantity == "gyro axes"
 
 
-@pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
-def test_velocities_in_axes_of_the_world_are_named_before_all_else(
-    yaw_rad: float,
-) -> None:
+def test_velocities_in_axes_of_the_world_are_named_before_all_else() -> None:
     """Whatever the heading of that world."""
     attitude = WORLD.truth.at(WORLD.dvl.stamps_ns).rotations()
-    world_R_body = Rotation.from_rotvec([0.0, 0.0, yaw_rad]) * attitude
+    world_R_body = Rotation.from_rotvec([0.0, 0.0, 2.0]) * attitude
     in_world = world_R_body.apply(WORLD.dvl.velocity @ BODY_R_DVL.T)
     run = spoilt(WORLD, "dvl", velocity=in_world @ BODY_R_DVL)
     assert turns_less_than_body(run.imu, run.dvl, run.calibration) > 2.0

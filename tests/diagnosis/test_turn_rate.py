@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sonar_graph.diagnosis import check_sensors, compared
-from sonar_graph.diagnosis.turn_rate import TURN_RATE
+from sonar_graph.diagnosis.turn_rate import TURN_RATE, turn_rate_finding
+from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.sequence import Sequence
 
-from .runs import acting, level_vehicle, names, spoilt
+from .runs import acting, level_vehicle, spoilt
 
 HZ = 50.0
 T = np.arange(0.0, 60.0, 1 / HZ)
@@ -31,12 +32,8 @@ def high_passed(rate):
 
 @pytest.mark.parametrize(
     "spoil",
-    [
-        lambda rate: rate * [1.0, 1.0, 0.5],
-        lambda rate: rate * [1.0, 1.0, 2.0],
-        high_passed,
-    ],
-    ids=["half", "double", "high-passed"],
+    [lambda rate: rate * [1.0, 1.0, 0.5], high_passed],
+    ids=["half", "high-passed"],
 )
 def test_a_turn_that_forces_and_velocities_show_and_gyros_do_not_is_grave(spoil):
     """No line: no single factor mends such a rate. Nothing else is advised beside it."""
@@ -64,7 +61,7 @@ def test_angle_increments_are_found_with_the_factor_to_rates():
     assert "`angular_velocity_scale = 50`" in finding.line
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
     """Beside a gap the velocity is known on one side only."""
     wave = 0.8 * np.sin(1.5 * T + seed)
@@ -74,11 +71,10 @@ def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
     t = (run.dvl.stamps_ns - run.start_ns) * 1e-9
     is_lost = ((t > 20.0) & (t < 24.0)) | ((t > 40.0) & (t < 43.5))
     with_gaps = replace(run, dvl=run.dvl.rows(~is_lost))
-    assert TURN_RATE not in names(check_sensors(with_gaps))
+    assert turn_rate_finding(with_gaps, LogConfig()) is None
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("waves_m_s2", [0.0, 3.0])
+@pytest.mark.parametrize(("seed", "waves_m_s2"), [(0, 0.0), (0, 3.0), (1, 3.0)])
 def test_right_gyros_are_not_contradicted(seed: int, waves_m_s2: float):
     """Also by accelerations of either level axis that the velocities, 5 a second and noisy, do not show."""
     run = level_drive(seed, phase=0.8 * seed)
@@ -92,4 +88,4 @@ def test_right_gyros_are_not_contradicted(seed: int, waves_m_s2: float):
         noise = 0.1 * rng.standard_normal(run.dvl.velocity.shape)
         run = spoilt(run, "imu", specific_force=force)
         run = spoilt(run, "dvl", velocity=run.dvl.velocity + noise)
-    assert TURN_RATE not in names(check_sensors(run))
+    assert turn_rate_finding(run, LogConfig()) is None

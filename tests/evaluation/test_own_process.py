@@ -14,6 +14,7 @@ import pytest
 from sonar_graph.errors import EstimatorError
 from sonar_graph.estimator import is_foreign
 from sonar_graph.evaluation import check_request, compare, run_estimator
+from sonar_graph.files import KilledError, OwnProcess
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 PLUGIN = """
@@ -52,10 +53,6 @@ class Exits(DeadReckoning):
     def process(self, measurements):
         sys.exit(3)
 
-class ExitsAtOnce(DeadReckoning):
-    def process(self, measurements):
-        os._exit(4)
-
 class Aborts(DeadReckoning):
     def process(self, measurements):
         os.abort()
@@ -68,7 +65,6 @@ CLASSES = (
     "Meddling",
     "Wording",
     "Exits",
-    "ExitsAtOnce",
     "Aborts",
     "Interrupts",
 )
@@ -146,7 +142,6 @@ def test_a_process_of_its_own_gives_the_same_numbers(plugin, mission, monkeypatc
     ("name", "reason"),
     [
         ("exits", r"s after the start .*: it called sys\.exit\(3\)"),
-        ("exitsatonce", "its process ended with code 4"),
         ("aborts", "its process was ended by SIGABRT"),
         ("interrupts", "KeyboardInterrupt: of its own"),
         (
@@ -160,6 +155,13 @@ def test_the_end_of_a_process_is_the_failure_of_its_run(plugin, mission, name, r
     assert run.status == "failed"
     assert re.search(reason, run.reason)
     assert "theirs" not in sys.modules
+
+
+def test_a_process_that_ends_by_itself_is_named_with_its_code():
+    process = OwnProcess(("-c", "raise SystemExit(4)"))
+    with pytest.raises(KilledError, match="its process ended with code 4"):
+        process.answer()
+    process.end()
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, None])

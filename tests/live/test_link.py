@@ -66,7 +66,7 @@ def test_a_router_or_bridge_that_is_not_there_is_named(where, fault):
 
 @pytest.fixture
 def mission(tmp_path) -> Sequence:
-    world = simulate_mission(MissionOptions(duration_s=20.0, frame_rate_hz=5.0))
+    world = simulate_mission(MissionOptions(duration_s=10.0, frame_rate_hz=5.0))
     write_log(tmp_path / "log.mcap", world)
     return world
 

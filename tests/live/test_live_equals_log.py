@@ -22,8 +22,7 @@ from tests.live.traffic import (
 )
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.2, 0.6])
-@pytest.mark.parametrize("world", [small_world, aided_world])
+@pytest.mark.parametrize(("world", "delay_s"), [(small_world, 0.2), (aided_world, 0.6)])
 def test_a_record_gives_the_steps_that_were_live(tmp_path, world, delay_s):
     """With messages that come late by random times, also later than the budget, which are then dropped by name."""
     engine, steps = live(

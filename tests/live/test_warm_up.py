@@ -26,7 +26,7 @@ def compiled():
 
 run(WARM_UP.model_copy(update={"duration_s": float(sys.argv[2])}) if sys.argv[2:] else WARM_UP, 10.0)
 before = compiled()
-run(MissionOptions(duration_s=90.0, seed=4, frame_rate_hz=10.0, dvl_dropouts_per_hour=200, dvl_dropout_s=4), 10.0)
+run(MissionOptions(duration_s=45.0, seed=4, frame_rate_hz=10.0, dvl_dropouts_per_hour=400, dvl_dropout_s=4), 10.0)
 print(json.dumps([len(before), sorted(compiled() - before)]))
 """
 

@@ -123,7 +123,7 @@ def test_the_start_stays_a_node_with_the_first_accepted_velocity():
 
 def test_wrong_rows_that_go_on_for_long_are_never_believed():
     """The gate widens from the last row that it believed, and doubt begins there too, however the log is cut."""
-    ns = stamps(5.0, 60.0)
+    ns = stamps(5.0, 40.0)
     t = (ns - T0_NS) * 1e-9
     wrong = (t > 10.0) & (t < 30.0)
     directions = np.random.default_rng(0).standard_normal((len(ns), 3))

@@ -203,10 +203,9 @@ def early(offset_s: float, wrong_rad: float = 0.0) -> Trajectory:
     )
 
 
-@pytest.mark.parametrize("offset_s", [-0.43, 0.25])
-def test_offset_is_found(offset_s):
-    found = referenced(RUN.imu, early(offset_s)).offset
-    assert abs(found.value - offset_s) < 4 * found.sigma < 0.1
+def test_offset_is_found():
+    found = referenced(RUN.imu, early(-0.43)).offset
+    assert abs(found.value + 0.43) < 4 * found.sigma < 0.1
 
 
 def test_a_wrong_start_heading_is_named():
@@ -257,8 +256,7 @@ def test_a_hole_soon_after_the_start_leaves_its_heading_unknown():
 @pytest.mark.parametrize("together", [13, 14, 16, 20])
 def test_a_doppler_log_in_short_pieces_is_not_matched_instead_of_an_error(together):
     """Rows in groups, with gaps between that end each stretch before it has more differences than parameters."""
-    whole = simulate_mission(MissionOptions(duration_s=90.0, landmarks=2))
-    is_kept = np.arange(len(whole.dvl)) % (together + 5) < together
-    found = match_dvl_to_imu(whole.imu, whole.dvl.rows(is_kept), whole.calibration)
+    is_kept = np.arange(len(RUN.dvl)) % (together + 5) < together
+    found = match_dvl_to_imu(RUN.imu, RUN.dvl.rows(is_kept), RUN.calibration)
     assert not found.offset.is_known
     assert found.offset.reason

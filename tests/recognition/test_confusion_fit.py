@@ -70,11 +70,6 @@ def few_frames_are_enough():
         yield
 
 
-@pytest.fixture(scope="module")
-def measured(lane_log) -> Confusion:
-    return confusion_fit.calibrate([(lane_log, read_log(lane_log))])
-
-
 def test_logs_count_together(lane_log, measured):
     run = read_log(lane_log)
     twice = confusion_fit.calibrate(

@@ -48,10 +48,10 @@ def clicks(lane, lane_log, lane_recognition) -> Labels:
 
 
 def test_a_few_labels_measure_what_the_whole_truth_does(
-    lane, lane_log, clicks, monkeypatch
+    lane, lane_log, clicks, measured, monkeypatch
 ):
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
-    by_truth = confusion_fit.calibrate([(lane_log, lane.sequence)])
+    by_truth = measured
     first = clicks.labels[0]
     frame = lane.one(0)
     vain = [

@@ -110,11 +110,9 @@ def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
 AN_L = (0.0, -0.12, 0.17, 0.05), (-0.12, 0.05, 0.05, 0.12)
 
 
-@pytest.mark.parametrize("middle_m", [(0.0, 0.0), (0.15, -0.1)])
-def test_a_landmark_is_where_the_middle_of_its_square_is(
-    middle_m,
-):
+def test_a_landmark_is_where_the_middle_of_its_square_is():
     """In frames of the simulator, at several headings; the candidate lies where the figure does."""
+    middle_m = (0.15, -0.1)
     design = design_of(*AN_L, size_m=0.7, middle_m=middle_m)
     sonar_m = np.array([0, 0, 0.95])
     tilt = Rotation.from_euler("Y", 0.52)

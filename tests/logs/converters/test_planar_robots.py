@@ -152,7 +152,7 @@ def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(tmp_pa
     )
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3, 4, 5])
+@pytest.fixture(scope="module", params=[1, 5])
 def sequence(request, unpacked):
     folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
     return read_mrclam(folder, request.param)
