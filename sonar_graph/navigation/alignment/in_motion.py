@@ -41,6 +41,8 @@ from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.samples import in_numbers
 from sonar_graph.numerics import chi_square_exceeded
 
+MOST_ROWS = 600
+"""Doppler rows, at most: ten a second for a minute."""
 FEWEST = 10
 """Fewest samples of the Doppler log."""
 SHORTEST_S = 2.0
@@ -205,15 +207,18 @@ def whole_doppler_rows(
     until = min(LONGEST_S, float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9)
     inside = (seconds >= 0.0) & (seconds <= until) & ~is_partial(dvl.velocity_cov)
     inside[1:] &= np.diff(dvl.stamps_ns) > 0
-    seconds = seconds[inside]
+    rows = np.flatnonzero(inside)
+    # every second, third, ... one of a fast log: all errors of all rows have one covariance
+    rows = rows[:: -(-max(len(rows), 1) // MOST_ROWS)]
+    seconds = seconds[rows]
     if len(seconds) < FEWEST or seconds[-1] - seconds[0] < SHORTEST_S:
         raise AlignmentError(
             f"alignment: {len(seconds)} Doppler samples beside the IMU; give {FEWEST} over {SHORTEST_S:g} s or more"
         )
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     default = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
-    R = in_numbers(dvl.velocity_cov[inside], default)
-    velocity = dvl.velocity[inside] @ body_R_dvl.T
+    R = in_numbers(dvl.velocity_cov[rows], default)
+    velocity = dvl.velocity[rows] @ body_R_dvl.T
     return seconds, velocity, body_R_dvl @ R @ body_R_dvl.T
 
 
