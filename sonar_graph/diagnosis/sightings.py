@@ -15,6 +15,8 @@ PAIR_S = 1.0
 LONGEST_PAIR_S = 3.0
 """And short enough to turn little."""
 FEWEST_PAIRS = 20
+FEWEST_LANDMARKS = 2
+"""Landmarks that tell a current, or a turn of the sonar."""
 PASSAGE_S = 10.0
 """Time in which a landmark stays above or below the sonar."""
 
@@ -66,6 +68,9 @@ def sighting_changes(
     if pairs is None:
         return None
     i, j = pairs.T
+    ids = seen.most_probable()[0]
+    # the height of a single one bends its ranges as a current or a turn of the sonar does
+    are_enough = len(np.unique(ids[i])) >= FEWEST_LANDMARKS
     mounting = sequence.calibration.sonar.mounting.pose()
     R = mounting.rotation().matrix()  # body_R_sonar
     lever = mounting.translation()
@@ -119,12 +124,15 @@ def sighting_changes(
         of_height = by_range(at) / seen.range_m[i] ** 2
         by_current = apart_s * np.column_stack([towards.real, towards.imag])
         turned = by_range(at, to_the_left)
+        if not are_enough:
+            by_current = np.zeros_like(by_current)
+            turned = np.zeros_like(turned)
         return np.column_stack([-by_current, -of_height, turned])
 
     changed = wrap_angle(sign * seen.azimuth_rad[j] - azimuth)
     longer = seen.range_m[j] - seen.range_m[i]
     climbed = np.asarray(height(t[j]) - height(t[i]), np.float64)
-    passage_of = np.stack([seen.most_probable()[0][i], t[j] // PASSAGE_S])
+    passage_of = np.stack([ids[i], t[j] // PASSAGE_S])
     passage = np.unique(passage_of, axis=1, return_inverse=True)[1].ravel()
     return SightingChanges(
         SignalStretch(t[j], longer, by_range, has_offset=False, beside=by_others),
