@@ -111,8 +111,10 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
     if not {"id", *PLACE} <= set(heads) or not (
         is_marginal or has_axes or "sigma_m" in heads
     ):
-        # spreadsheets of some countries write semicolons
-        apart = "; separate them by commas" if ";" in text.partition("\n")[0] else ""
+        apart = ""
+        # as spreadsheets of some countries write
+        if {";", "\t"} & set(text.partition("\n")[0]):
+            apart = "; separate them by commas, with points in decimals"
         missing = [name for name in ("id", *PLACE) if name not in heads] or ["a sigma"]
         lacking = "" if len(missing) > 2 else f"{' and '.join(missing)}: missing: "
         raise LogError(

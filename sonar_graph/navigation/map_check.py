@@ -67,6 +67,12 @@ MISTAKES = {
     "it is in millimetres": 0.001 * np.eye(3),
 }
 """Mistake of a map, and the matrix that undoes it."""
+OR_FORWARD = ", where x_m counts to the north; else negate y_m and z_m"
+OTHER_REMEDIES = {
+    MIRRORED: ", where they are swapped; else negate the one of the wrong sign",
+    NORTH_EAST_DOWN: OR_FORWARD,
+}
+"""What else undoes a mistake: sightings leave the heading of the world open."""
 MORE_SHOWN = 0.25
 """Share of the sightings that the vertical aperture allows only with the other sign of the heights."""
 LEAST_SHOWN = 0.5
@@ -115,7 +121,7 @@ def map_fit(sequence: Sequence) -> MapFit:
         # the same heights, and x and y exchanged: the other landmarks decide
         exchanged = followed(sequence, undone(known, T))
         if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
-            return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T))
+            return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T) + OR_FORWARD)
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
     if rise_m:
         raised = followed(sequence, moved_up(known, rise_m))
@@ -147,11 +153,7 @@ def map_fit(sequence: Sequence) -> MapFit:
         is_same_area = bool(np.isclose(abs(np.linalg.det(T)), 1.0))
         is_clear = is_same_area and math.isfinite(gain) and gain > math.log(CLEAR)
         if is_clear or (is_doubted and gives_start(sequence, corrected.map)):
-            remedy = remedy_of(known, T)
-            if mistake == MIRRORED:
-                remedy += (
-                    ", where they are swapped; else negate the one of the wrong sign"
-                )
+            remedy = remedy_of(known, T) + OTHER_REMEDIES.get(mistake, "")
             return MapFit(None, mistake, remedy)
     swaps = exchanged_identities(given.sightings, known)
     if swaps:

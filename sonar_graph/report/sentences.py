@@ -364,7 +364,9 @@ def doubt_of_identities(comparison: Comparison) -> list[str]:
         if wrong:
             policy = flattened(run.params).get(POLICY)
             named = "" if policy is None else f' ({POLICY} is "{policy}")'
-            advice = f"look at identities{named}, then at noise and start"
+            has_map = comparison.sequence.calibration.map is not None
+            of_map = "sigmas of the map, then at " if has_map else ""
+            advice = f"look at {of_map}identities{named}, then at noise and start"
             lines.append(
                 f"{WARNING}: {run.estimator}{said} {max(wrong.values()):.0f}); {advice}"
             )
