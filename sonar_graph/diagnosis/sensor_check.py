@@ -317,6 +317,10 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
     if level_speed_m_s(sequence.dvl) < LEAST_SPEED_SIGMAS * BEST_NOISE_M_S:
         z = unknown("too slow for a turn to bend the path")
     driven = (unknown(NO_GRAVITY),) * 3 if lacks_gravity(sequence) else (x, y, z)
+    if match.scale.is_known and any(finding.acts for finding in forces):
+        # velocities cannot be compared better than the forces' own scale is known
+        sigma = float(np.hypot(match.scale.sigma, forces[0].estimate.sigma))
+        match = replace(match, scale=replace(match.scale, sigma=sigma))
     of_dvl = dvl_findings(match, sequence, config)
     # each following check sees the log as these lines would make it
     right = corrected_sequence(sequence, match, of_dvl)

@@ -367,6 +367,16 @@ def test_a_delay_that_all_others_share_is_that_of_the_imu(sensor: str) -> None:
     assert not [name for name in names(found) if name.endswith(": delay")]
 
 
+def test_velocities_are_known_no_better_than_the_scale_of_the_forces() -> None:
+    """Forces that are 1.25 times too long are put right to 0.1 %: no velocity can be compared with them more closely."""
+    sigmas = []
+    for factor in (1.0, 1.25):
+        force = factor * RIGHT.imu.specific_force
+        found = by_name(check_sensors(spoilt(RIGHT, "imu", specific_force=force)))
+        sigmas.append(found["DVL scale"].estimate.sigma)
+    assert sigmas[1] ** 2 - sigmas[0] ** 2 == pytest.approx(1e-3**2, rel=0.3)
+
+
 def test_of_forces_without_gravity_nothing_else_is_blamed() -> None:
     """Neither a bias of the gyros nor depth, heading or fixes."""
     up = RIGHT.truth.at(RIGHT.imu.stamps_ns).rotations().as_matrix()[:, 2, :]
