@@ -151,6 +151,8 @@ LEAST_YAW_RAD = np.radians(0.25)
 LEAST_LEAN_RAD = np.radians(3.0)
 """Roll and pitch of a mounting that is not measured."""
 LEAST_SCALE = 0.002
+FROM_START = "distance from the start"
+"""End of the quantities of sensors that are compared with a stated start."""
 LARGE_OFFSET_S = 0.2
 """Beyond it the Doppler log contradicts the accelerometers so much that results are doubtful."""
 LARGE_SCALE = 0.05
@@ -452,7 +454,9 @@ def by_late_imu(
         cause=f"{names} differ from the IMU by as much: the IMU's own stamps are wrong",
         line=shift_line("imu", config, -offset.value),
     )
-    return [of_imu, *others], [f for f in by_motion if f not in delays]
+    # the first IMU row is the start, and is stamped late
+    left = [f for f in by_motion if not f.quantity.endswith(FROM_START)]
+    return [of_imu, *others], [f for f in left if f not in delays]
 
 
 def middle_rows(sequence: Sequence) -> tuple[Imu, Dvl]:
