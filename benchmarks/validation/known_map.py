@@ -420,7 +420,8 @@ def named_landmarks(messages: list[str]) -> set[int]:
     named = set()
     for line in messages:
         listed = re.search(
-            r"landmarks? ([0-9., ]+): (mapped|sightings contradict)", line
+            r"landmarks? ([0-9., ]+): (mapped|their sightings|sightings contradict)",
+            line,
         )
         for part in listed[1].split(", ") if listed else ():
             first, *rest = part.split("..")
