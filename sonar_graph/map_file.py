@@ -111,14 +111,15 @@ def of_table(text: str, path: Path) -> tuple[KnownMap, bool]:
     if not {"id", *PLACE} <= set(heads) or not (
         is_marginal or has_axes or "sigma_m" in heads
     ):
-        apart = ""
         # as spreadsheets of some countries write
         if {";", "\t"} & set(text.partition("\n")[0]):
-            apart = "; separate them by commas, with points in decimals"
+            raise LogError(
+                f"{path}: expected the columns {COLUMNS}; separate them by commas, with points in decimals"
+            )
         missing = [name for name in ("id", *PLACE) if name not in heads] or ["a sigma"]
         lacking = "" if len(missing) > 2 else f"{' and '.join(missing)}: missing: "
         raise LogError(
-            f"{path}: {lacking}expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}{apart}"
+            f"{path}: {lacking}expected the columns {COLUMNS}, not {', '.join(heads) or 'an empty file'}"
         )
     if has_axes < bool(set(SIGMAS) & set(heads)):
         raise LogError(f"{path}: expected all of {', '.join(SIGMAS)}, or sigma_m alone")

@@ -1236,6 +1236,7 @@ BAD = {
         "expected all of sigma_x_m, sigma_y_m, sigma_z_m, or sigma_m alone",
     ),
     "semicolons": (HEAD.replace(",", ";"), "separate them by commas"),
+    "tabs": (HEAD.replace(",", "\t"), "separate them by commas, with points"),
     "a grid of a country": (
         HEAD + "1,512345,2,3,0.1\n",
         "give metres from an origin near by",
