@@ -191,7 +191,7 @@ def live(
         smoothed=None if is_lost else outcome.smoothed,
         landmarks=None if is_lost else outcome.landmarks,
         refused=outcome.refused,
-        withheld=outcome.withheld,
+        withheld=[] if is_lost else outcome.withheld,
         update_s=np.array(outcome.update_s),
         finish_s=outcome.finish_s,
     )

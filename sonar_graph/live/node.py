@@ -341,8 +341,6 @@ class LiveRun:
         mapped = answer.landmarks
         if mapped is not None:
             self._now.landmarks = len(mapped)
-        for estimate in answer.estimates:
-            self._put("/sonar_graph/pose", self._forms.estimate(estimate))
         lacking = [each for each in answer.withheld if each.startswith(NOT_LOCATED)]
         if lacking and "located" in self._told:
             self._told.discard("located")
@@ -352,6 +350,8 @@ class LiveRun:
             self._now.at = None
         if lacking or not answer.estimates:
             return
+        for estimate in answer.estimates:
+            self._put("/sonar_graph/pose", self._forms.estimate(estimate))
         newest = answer.estimates[-1]
         self._predictor.correct(newest)
         map_T_odom = self._predictor.map_T_odom
