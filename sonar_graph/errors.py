@@ -47,7 +47,14 @@ class DatasetError(LogError):
 
 
 class AlignmentError(SonarGraphError):
-    """Attitude and gyro bias cannot be determined from a stretch of a run."""
+    """Attitude and gyro bias cannot be determined from a stretch of a run.
+
+    ``misfit``: root mean square of differences over their sigmas, where sensors contradict each other.
+    """
+
+    def __init__(self, message: str, misfit: float = 0.0) -> None:
+        super().__init__(message)
+        self.misfit = misfit
 
 
 class EstimatorError(SonarGraphError):

@@ -8,6 +8,7 @@ docs/theory/sensor_check.md.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -972,6 +973,8 @@ JUMP_GATE = chi_square_quantile(1 - 1e-4, 3)
 LARGEST_JUMPING_SHARE = 0.2
 """Of the fixes; single outliers are what a robust kernel is for."""
 FEWEST_JUMPS = 6
+LEAST_WAY_M = 0.1
+"""Way by the Doppler log against which a jump's size is told."""
 NEAR_START = 6
 """Number of fixes about the start whose median is compared with it."""
 SEEN_WITHIN_S = 60.0
@@ -993,8 +996,18 @@ def way_m(right: Sequence, at_ns: np.ndarray) -> np.ndarray:
     return np.interp(at_ns, stamps_ns, np.append(0.0, np.cumsum(mean_speed * steps_s)))
 
 
-def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
-    """Share of fixes from which the one `JUMP_NS` later is farther than the Doppler log moves, and their number.
+class Jumps(NamedTuple):
+    """Fixes from which the one `JUMP_NS` later is farther than the vehicle moves."""
+
+    share: float
+    """Of the fixes that are compared."""
+    compared: int
+    times: float
+    """Median distance of the two over the way by the Doppler log."""
+
+
+def jumps_of(right: Sequence, fixes: PositionFixes) -> Jumps:
+    """Fixes from which the one `JUMP_NS` later is farther than the Doppler log moves.
 
     With l the way by the Doppler log, a displacement Δ of length d is beyond it by ``e = Δ (1 - l / d)``, and is no
     noise of the two fixes where ``eᵀ (C_i + C_j)⁻¹ e`` is above `JUMP_GATE`.
@@ -1006,17 +1019,22 @@ def jumping_share(right: Sequence, fixes: PositionFixes) -> tuple[float, int]:
     i = np.flatnonzero((later < len(t)) & (t >= dvl_ns[0]))
     i = i[t[later[i]] <= dvl_ns[-1]]
     if not len(i):
-        return 0.0, 0
+        return Jumps(0.0, 0, 1.0)
     j = later[i]
-    way = way_m(right, t)
+    at_fixes_m = way_m(right, t)
+    way = at_fixes_m[j] - at_fixes_m[i]
     moved = fixes.position_m[j] - fixes.position_m[i]
     length = np.maximum(np.linalg.norm(moved, axis=1), 1e-9)
-    beyond = moved * np.maximum(0.0, 1 - (way[j] - way[i]) / length)[:, None]
+    beyond = moved * np.maximum(0.0, 1 - way / length)[:, None]
     noise = np.diag(np.square(right.calibration.positions.sigma_m))
     cov_m2 = np.where(np.isnan(fixes.covariance_m2), noise, fixes.covariance_m2)
     normalised = np.linalg.solve(cov_m2[i] + cov_m2[j], beyond[:, :, None])[:, :, 0]
     squares = np.sum(beyond * normalised, axis=1)
-    return float(np.mean(squares > JUMP_GATE)), len(i)
+    jumps = squares > JUMP_GATE
+    times = length[jumps] / np.maximum(way[jumps], LEAST_WAY_M)
+    if not len(times):
+        return Jumps(0.0, len(i), 1.0)
+    return Jumps(float(np.mean(jumps)), len(i), float(np.median(times)))
 
 
 def position_findings(
@@ -1031,7 +1049,7 @@ def position_findings(
     if rows[0].grave and "%" not in rows[0].advice:
         yield rows[0]
         return
-    share, count = jumping_share(right, fixes)
+    share, count, times = jumps_of(right, fixes)
     # of another scale, fixes move farther than the vehicle too
     is_scaled = rows[0].acts and not rows[0].grave
     is_often = share > LARGEST_JUMPING_SHARE and share * count >= FEWEST_JUMPS
@@ -1039,8 +1057,8 @@ def position_findings(
         sigma = float(np.sqrt(share * (1 - share) / count))
         yield contradiction(
             "position fixes: jumps",
-            cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart are farther from each other than the vehicle moves by its "
-            "Doppler log and their noise allows: angles, another scale, or of another thing?",
+            cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart move {times:.3g} times as much as the vehicle by its Doppler "
+            "log, beyond their noise: angles, another scale, or of another thing?",
             line=f"{unused('positions')} leaves them out; or they are worse than `positions.sigma_m` {IN_CALIBRATION}",
             estimate=Estimate1D(100 * share, 100 * sigma),
             unit="%",

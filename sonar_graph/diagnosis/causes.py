@@ -32,10 +32,16 @@ from sonar_graph.diagnosis.signals import (
     explained,
     steps,
 )
-from sonar_graph.diagnosis.start import turned_mounting
+from sonar_graph.diagnosis.start import lacks_gravity, turned_mounting, without_bias
 from sonar_graph.diagnosis.turn_rate import residual
-from sonar_graph.measurements import Floats
-from sonar_graph.navigation.alignment import Estimate1D
+from sonar_graph.errors import AlignmentError
+from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.navigation.alignment import (
+    LONGEST_S,
+    Estimate1D,
+    align_in_motion,
+    until_hole,
+)
 from sonar_graph.numerics import running_integral
 from sonar_graph.sequence import Sequence
 
@@ -54,6 +60,9 @@ BEST_NOISE_M_S = 0.01
 JUMPING = 2.0
 """Ratio of a change to that of the path beyond which it shows no direction."""
 LONGEST_LIST = 3
+LARGEST_MISFIT = 10.0
+"""Differences over their sigmas, beyond those of noise that is stated too small."""
+MOST_MINUTES = 5
 
 
 @dataclass(frozen=True)
@@ -391,6 +400,46 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
         line=f"leave the rows without bottom lock out (`lock` under [dvl] {IN_LOG_CONFIG}), or that part by --start and "
         "--end",
     )
+
+
+def unlike_pair(sequence: Sequence) -> Finding | None:
+    """Doppler log and IMU that contradict each other in one of up to five minutes, by what no other comparison knows."""
+    if np.isnan(sequence.imu.specific_force).all() or lacks_gravity(sequence):
+        return None
+    first_ns, *_, last_ns = sequence.imu.stamps_ns.tolist()
+    minute_ns = round(LONGEST_S * NS_PER_S)
+    count = int(np.clip((last_ns - first_ns) // minute_ns, 1, MOST_MINUTES))
+    begins_ns = np.linspace(first_ns, max(first_ns, last_ns - minute_ns), count)
+    misfits = np.array([misfit_of(sequence, int(begin)) for begin in begins_ns])
+    unlike = np.flatnonzero(misfits > LARGEST_MISFIT)
+    if not len(unlike):
+        return None
+    from_s = (begins_ns[unlike[0]] - first_ns) / NS_PER_S
+    cause = (
+        f"in {len(unlike)} of {count} minutes, from {from_s:.0f} s on, velocities and accelerations differ up to "
+        f"{misfits.max():.0f} times more than their noise says; whether axes, stamps, scale or noise of either is wrong "
+        "could not be found, and other sensors were not compared"
+    )
+    line = f"compare axes, stamps and units of both with their manuals, and the noise {IN_CALIBRATION} with theirs"
+    quantity = "DVL against IMU: velocities and accelerometers"
+    return contradiction(quantity, cause, line, "they contradict each other")
+
+
+def misfit_of(sequence: Sequence, begin_ns: int) -> float:
+    """Differences of velocities and accelerations of a minute over their sigmas; 0 where they are usual, or too few."""
+    end_ns = begin_ns + round(LONGEST_S * NS_PER_S)
+    calibration = sequence.calibration
+    imu = without_bias(sequence.imu, calibration).between(begin_ns - 1, end_ns)
+    dvl = sequence.dvl.between(begin_ns - 1, end_ns)
+    if imu is None or dvl is None:
+        return 0.0
+    try:
+        align_in_motion(until_hole(imu), dvl, calibration)
+    except AlignmentError as error:
+        return error.misfit
+    except np.linalg.LinAlgError:
+        pass  # the noise of the calibration is zero
+    return 0.0
 
 
 def turned_to(y: Values, x: Values) -> Values:

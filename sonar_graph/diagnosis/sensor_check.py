@@ -49,6 +49,7 @@ from sonar_graph.diagnosis.causes import (
     BEST_NOISE_M_S,
     PITCH,
     pitched_one,
+    unlike_pair,
     velocity_steps,
 )
 from sonar_graph.diagnosis.findings import (
@@ -334,6 +335,9 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         of_dvl = [contradicted(finding, names) for finding in of_dvl]
         no_arm = "IMU and Doppler log do not fit"
         right = sequence
+    is_explained = any(f.acts for f in [*axes, *of_dvl])
+    if not is_explained and (unlike := unlike_pair(right)):
+        return [*forces, *axes, *of_dvl, unlike]
     tilt = find_start_tilt(right)
     estimates, sources = surest_bias(driven, tilt)
     up = UPRIGHT

@@ -13,7 +13,15 @@ from sonar_graph.measurements import Depth, Floats, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
-from .runs import acting, fix_rows, grave, heading_rows, spoilt, unstated
+from .runs import (
+    acting,
+    fix_rows,
+    grave,
+    heading_rows,
+    level_vehicle,
+    spoilt,
+    unstated,
+)
 from .test_turn_rate import T, level_drive
 
 NOISE = np.random.default_rng(3).standard_normal((len(T), 3))
@@ -154,6 +162,31 @@ def test_velocities_that_jump_without_a_force_have_lost_the_bottom():
     assert found.quantity == "DVL: steps"
     times_s = [float(text) for text in re.findall(r"at ([0-9.]+) s", found.cause)]
     assert times_s == pytest.approx([20.2, 40.0], abs=0.4)
+
+
+def wandering(seed: int) -> Floats:
+    """Smooth velocities of a minute at 50 Hz, m/s."""
+    rng = np.random.default_rng(seed)
+    hz = rng.uniform(0.02, 0.1, (4, 3))
+    phase = rng.uniform(0.0, 6.0, (4, 3))
+    t = np.arange(3500) / 50.0
+    waves = np.sin(2 * np.pi * hz * t[:, None, None] + phase)
+    begun = np.minimum(t / 5.0, 1.0)
+    return 0.5 * begun[:, None] * waves.sum(axis=1) * [1.0, 1.0, 0.2]
+
+
+@pytest.mark.parametrize("rest_s", [0.0, 70.0])
+def test_velocities_of_another_vehicle_are_doubtful_also_after_a_rest(rest_s: float):
+    """No axes, stamps or scale bring them together, so that none is named, nor any other sensor; its own are right."""
+    rest = np.zeros((round(50 * rest_s), 3))
+    own, other = (
+        level_vehicle(np.vstack([rest, wandering(seed)]), np.zeros(len(rest) + 3500), 1)
+        for seed in (0, 1)
+    )
+    assert not acting(own)
+    (found,) = acting(replace(own, dvl=other.dvl))
+    assert found.grave
+    assert found.quantity == "DVL against IMU: velocities and accelerometers"
 
 
 def straight(scale: float) -> Sequence:

@@ -178,9 +178,11 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
             break
     freedom = 3 * len(seconds) - 5
     if misfit > LARGEST_MISFIT * chi_square_exceeded(FALSE_ALARM, freedom):
+        times = float(np.sqrt(misfit / freedom))
         raise AlignmentError(
-            f"alignment: velocities and accelerations differ {np.sqrt(misfit / freedom):.1f} times more than their "
-            "noise says; check mountings and stamps with `sonar-graph inspect`, and the densities in the calibration"
+            f"alignment: velocities and accelerations differ {times:.1f} times more than their noise says; check "
+            "mountings and stamps with `sonar-graph inspect`, and the densities in the calibration",
+            times,
         )
     by_step = np.zeros((5, 13))
     by_step[:2, TILT] = angles_by_up(state.up) @ _across(state.up)
