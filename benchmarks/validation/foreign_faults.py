@@ -113,6 +113,17 @@ def clockwise(log: Log, _: float) -> None:
     log.yaw_rad = np.pi / 2 - log.yaw_rad
 
 
+def in_world(log: Log, _: float) -> None:
+    """Velocities along axes of the world, as the twist of an odometry message in the wrong frame."""
+    roll, pitch, yaw = log.start[1]
+    turns = Rotation.from_rotvec(log.rate[:-1] * np.diff(log.imu_s)[:, None])
+    attitudes = [Rotation.from_euler("ZYX", [yaw, pitch, roll])]
+    for step in turns:
+        attitudes.append(attitudes[-1] * step)
+    at = np.searchsorted(log.imu_s, log.dvl_s).clip(max=len(attitudes) - 1)
+    log.velocity = Rotation.concatenate([attitudes[k] for k in at]).apply(log.velocity)
+
+
 def bias_of_yaw_rate(log: Log, rad_s: float) -> None:
     log.rate[:, 2] += rad_s
 
@@ -282,6 +293,7 @@ def of_velocity() -> Iterator[Fault]:
     yield row(SENSE, "pitched, degrees", LEANS, leaning("y", "velocity"), LEANING, roles=EITHER)
     quarter = turned("velocity", QUARTER_TURN)
     yield row(SENSE, "turned by 90 degrees", AGAIN, quarter, r"DVL axes|mounting yaw", roles=either)
+    yield row(SENSE, "in axes of the world", AGAIN, in_world, r"axes of the world", roles=either)
     yield row("marked invalid", "share, huge variance", SHARES, Marked("velocity", "dvl_s", "velocity", True), LEFT_OUT)
     yield row("marked invalid", "share, NaN", SHARES, Marked("velocity", "dvl_s", "velocity", False), LEFT_OUT)
     row = partial(row, roles=roles("dvl", "positions", "detections", "depth"))

@@ -175,12 +175,11 @@ def match_rows(
     motion: BodyMotion,
     seconds: Floats,
     y: Values,
-    x: Values,
+    reference: Callable[[Floats], Values],
     drift_sigma: float = 0.0,
     longest_s: float = STRETCH_S,
 ) -> Match:
-    """Rows of a sensor compared with what the motion has at its own rows; also in one piece, for the search of causes."""
-    reference = motion.reference(x)
+    """Rows of a sensor compared with the motion; also in one piece, for the search of causes."""
     found = match(motion.stretches(seconds, y, reference, longest_s), drift_sigma)
     whole = motion.stretches(seconds, y, reference, np.inf)
     return replace(found, whole=tuple(whole))
@@ -196,7 +195,7 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     # the noise of velocities adds up to a walk of the height, which grows with the time compared
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
-    found = match_rows(motion, t, depth.z_m, height, 0.03, longest_s)
+    found = match_rows(motion, t, depth.z_m, motion.reference(height), 0.03, longest_s)
     ahead = motion.reference(motion.ahead_m)
     stretches = [
         replace(part, beside=lambda t: ahead(t)[:, None]) for part in found.stretches
@@ -216,14 +215,26 @@ def climb_sigma(sequence: Sequence) -> float:
     return velocity_m_s * float(np.sqrt(interval_s * duration_s)) / 8.0
 
 
+def unwrapped(yaw_rad: Floats) -> Floats:
+    """Headings without jumps by a turn, shape (n,): wild rows do not carry those after them over a turn.
+
+    The middle of five directions is unwrapped, and each row stays near it.
+    """
+    directions = np.exp(1j * np.pad(yaw_rad, 2, mode="edge"))
+    five = np.lib.stride_tricks.sliding_window_view(directions, 5)  # (n, 5)
+    middle = np.median(five.real, axis=1) + 1j * np.median(five.imag, axis=1)
+    steady = np.unwrap(np.angle(middle))
+    return np.asarray(steady + wrap_angle(yaw_rad - steady))
+
+
 def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     """Heading by the gyros, which drift."""
     heading = sequence.heading
     if heading is None:
         return None
     t = motion.since_origin(heading.stamps_ns)
-    yaw_rad = np.unwrap(heading.yaw_rad)
-    return match_rows(motion, t, yaw_rad, motion.yaw_rad, 0.02)
+    yaw_rad = unwrapped(heading.yaw_rad)
+    return match_rows(motion, t, yaw_rad, motion.turned, 0.02)
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -236,7 +247,7 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = match_rows(motion, t, level, path)
+    found = match_rows(motion, t, level, motion.reference(path))
     return found.less_certain(motion.sampling_error(motion.path_m))
 
 
@@ -667,6 +678,8 @@ FAULTS = (
 
 
 LEAST_BIAS_S = 30.0
+LARGEST_BIAS_RAD_S = 0.2
+"""No gyro that works has such a bias."""
 
 
 def vertical_bias(
@@ -685,7 +698,7 @@ def vertical_bias(
     if sequence.heading is not None:
         source = "the heading"
         stamps_ns = sequence.heading.stamps_ns
-        yaw_rad = np.unwrap(sequence.heading.yaw_rad)
+        yaw_rad = unwrapped(sequence.heading.yaw_rad)
     elif truth is not None and len(truth) > 1:
         source = "the true orientations"
         stamps_ns = truth.stamps_ns
@@ -694,7 +707,7 @@ def vertical_bias(
         return None
     bias = unknown(f"too little time beside {source}")
     t = motion.since_origin(stamps_ns)
-    drift_rad = motion.reference(motion.yaw_rad)(t) - yaw_rad
+    drift_rad = motion.turned(t) - yaw_rad
     # against time itself, whose gain is the rate
     rows = motion.stretches(t, drift_rad, lambda seconds: seconds)
     duration_s = sum(float(np.ptp(part.seconds)) for part in rows)
@@ -727,18 +740,23 @@ def vertical_bias(
         gravity=gravity_of(turned_rad > LARGE_TURN_RAD),
     )
     # the truth drifts from nothing
-    if sequence.heading is None or not all(one.is_known for one in axes):
+    if sequence.heading is None:
         return row
-    sigma = float(np.linalg.norm([one.sigma for one in axes] * up))
     apart = bias.minus(float(known @ up))
-    if not matters(apart, LEAST_BIAS_RAD_S, sigma):
+    cause = "it turns otherwise than the gyros, whose bias is known: a compass that drifts, or is disturbed"
+    if abs(bias.value) > LARGEST_BIAS_RAD_S:
+        cause = "it turns otherwise than the gyros, by more than any bias of theirs: degrees that are read as radians?"
+    elif not all(one.is_known for one in axes) or not matters(
+        apart,
+        LEAST_BIAS_RAD_S,
+        float(np.linalg.norm([one.sigma for one in axes] * up)),
+    ):
         return row
     return replace(
         row,
         quantity=f"{HEADING.name}: drift",
         estimate=replace(apart, value=-apart.value),
-        cause="it turns otherwise than the gyros, whose bias forces and velocities show: a compass that drifts, or is "
-        "disturbed",
+        cause=cause,
         line=unused(HEADING.role),
     )
 
@@ -883,7 +901,7 @@ def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Find
         return
     rows = first_rows(heading.stamps_ns, right.start_ns)
     t = motion.since_origin(heading.stamps_ns[rows])
-    turned = motion.reference(motion.yaw_rad)(t) - motion.yaw_rad[0]
+    turned = motion.turned(t) - motion.yaw_rad[0]
     off = wrap_angle(heading.yaw_rad[rows] - turned - start.rpy_rad[2])
     off = off[np.isfinite(off)]
     calibration = right.calibration.heading
@@ -953,7 +971,7 @@ def course_angle(
     assert right.heading is not None
     places = known.position_m if isinstance(known, PositionFixes) else known.positions
     heading_s = motion.since_origin(right.heading.stamps_ns)
-    yaw_rad = np.interp(motion.seconds, heading_s, np.unwrap(yaw_rad))
+    yaw_rad = np.interp(motion.seconds, heading_s, unwrapped(yaw_rad))
     steps = np.diff(motion.path_m) * np.exp(1j * (yaw_rad - motion.yaw_rad))[1:]
     path = np.append(0.0, np.cumsum(steps))
     t = motion.since_origin(known.stamps_ns)

@@ -39,6 +39,9 @@ LEAST_GAIN = 60.0
 """Least drop of chi-square, by the noise that the best candidate leaves; 48 candidates come by chance to some 15."""
 LEAST_RATIO = 1.3
 """Least ratio of the sums of squares as they are and at the best candidate."""
+WORLD_GAIN = 100.0
+WORLD_RATIO = 1.6
+"""The same for velocities of the world, of which a vehicle that hardly turns shows little: right logs reach 66 and 1.4."""
 LEAST_SECOND = 0.3
 """Second singular value of the matrix of velocities over its first, from which on they have two directions."""
 OTHER_UNIT = 1.3
@@ -221,7 +224,8 @@ def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float 
     # of a way straight up and down the level velocities are noise, which a matrix of one direction leaves out
     first, second, _ = np.linalg.svd(matrix, compute_uv=False)
     has_level_way = second > LEAST_SECOND * first
-    if of_body > LEAST_RATIO * of_world and gain > LEAST_GAIN and has_level_way:
+    is_closer = of_body > WORLD_RATIO * of_world and gain > WORLD_GAIN
+    if is_closer and has_level_way:
         return float(np.sqrt(of_body / of_world))
     return None
 

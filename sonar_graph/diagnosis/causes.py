@@ -62,7 +62,7 @@ JUMPING = 2.0
 LONGEST_LIST = 3
 LARGEST_MISFIT = 10.0
 """Differences over their sigmas, beyond those of noise that is stated too small."""
-MOST_MINUTES = 5
+MOST_MINUTES = 3
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ def current_advice(q: Values, _: Calibration) -> Advice:
     """Velocities over something that moves."""
     return Advice(
         f"the path moves away by {float(np.linalg.norm(q)):.2g} m/s in one direction: the Doppler log measures the water, "
-        "not the bottom",
+        "not the bottom; or, on a way that hardly turns, north and east of the fixes are exchanged",
         f"name a `topic` with its bottom track under [dvl] {IN_LOG_CONFIG}",
     )
 
@@ -403,7 +403,7 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
 
 
 def unlike_pair(sequence: Sequence) -> Finding | None:
-    """Doppler log and IMU that contradict each other in one of up to five minutes, by what no other comparison knows."""
+    """Doppler log and IMU that contradict each other in one of up to three minutes, by what no other comparison knows."""
     if np.isnan(sequence.imu.specific_force).all() or lacks_gravity(sequence):
         return None
     first_ns, *_, last_ns = sequence.imu.stamps_ns.tolist()

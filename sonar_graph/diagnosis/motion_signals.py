@@ -93,6 +93,10 @@ class BodyMotion:
     """Complex, shape (n,), level, in axes that are the body's at the first row."""
     ahead_m: Floats
     """Way ahead, shape (n,), backwards negative, since the first row."""
+    imu_s: Floats
+    """Since ``origin_ns``, shape (m,), of the IMU's rows."""
+    imu_yaw_rad: Floats
+    """The yaw there, shape (m,)."""
     felt: "FeltMotion | None" = None
     """None without gravity in the forces."""
 
@@ -157,8 +161,16 @@ class BodyMotion:
             height_m=running_integral(t, np.sum(v * up, axis=1), is_held=is_held),
             path_m=running_integral(t, level_v * np.exp(1j * yaw_rad), is_held=is_held),
             ahead_m=running_integral(t, level_v.real, is_held=is_held),
+            imu_s=path.seconds,
+            imu_yaw_rad=yaw_at_imu,
             felt=felt,
         )
+
+    def turned(self, seconds: Floats) -> Floats:
+        """Yaw at other times, by the IMU's rows: the Doppler log's may be slow; NaN as of `reference`."""
+        known = self.reference(self.yaw_rad)(seconds)
+        at_imu = np.interp(seconds, self.imu_s, self.imu_yaw_rad)
+        return np.where(np.isnan(known), np.nan, at_imu)
 
     def reference(self, values: Values) -> Callable[[Floats], Values]:
         """Values of the rows at other times, linear; NaN outside and between parts."""

@@ -169,7 +169,8 @@ PAIRED_SIGMAS = 2.0
 LEAST_TOGETHER_S = 0.1
 """Difference between two delays that counts as none."""
 LEAST_SHARE_OF_DELAY = 0.5
-"""Share of a late IMU's delay that sightings and fixes show at least."""
+MOST_SHARE_OF_DELAY = 1.5
+"""Share of a late IMU's delay that depths, sightings and fixes show."""
 LEAST_SPEED_SIGMAS = 10.0
 """Level speed over the noise of a good Doppler log, from which on its slow errors are no bias of the gyros."""
 WILD = 5.0
@@ -449,7 +450,7 @@ def by_late_imu(
         is_apart = matters(together, LEAST_TOGETHER_S, offset.sigma)
         # all but headings are compared with a path of the Doppler log, which is in time, along the late turns
         share = -delay.estimate.value / offset.value
-        is_between = LEAST_SHARE_OF_DELAY < share < 1.0
+        is_between = LEAST_SHARE_OF_DELAY < share < MOST_SHARE_OF_DELAY
         if is_apart and (delay.quantity.startswith(HEADING.name) or not is_between):
             return of_dvl, by_motion
     names = " and ".join(delay.quantity.partition(" against")[0] for delay in delays)
@@ -528,8 +529,10 @@ def axes_findings(
         return [], sequence
     found = match_axes(sequence.imu, sequence.dvl, calibration)
     ratio = turns_less_than_body(sequence.imu, sequence.dvl, calibration)
-    # turns of the wrong sense fit no velocities of the body either
-    if ratio is not None and (found is None or found.ratio < ratio):
+    # with gyros of wrong axes no velocities of the body fit
+    if ratio is not None and (
+        found is None or found.ratio < ratio or (found.gyro == np.eye(3)).all()
+    ):
         cause = f"velocities change, {ratio:.2g} times closer, as in axes of the world, and do not turn with the vehicle"
         return [no_axes_finding(DVL_AXES, cause)], sequence
     # steps of a velocity fit no axes, and have a finding of their own
@@ -745,9 +748,10 @@ def motion_findings(
     # positions, where there are any, give the angle itself
     if not any(f.acts for f in of_heading):
         found += start_heading_findings(right, motion)
-    found += position_findings(matches[POSITIONS], right, config, motion)
-    # a wrong unit of either makes another height too
-    if not any(f.grave for f in found):
+    of_fixes = list(position_findings(matches[POSITIONS], right, config, motion))
+    found += of_fixes
+    # a wrong unit of either, or scale of the fixes, makes another height too
+    if not any(f.grave or (f.acts and f in of_fixes) for f in found):
         found += fix_height_findings(right, config)
     # sensors that are wrong lead elsewhere too
     if not any(f.grave for f in found):

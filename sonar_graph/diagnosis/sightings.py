@@ -85,7 +85,7 @@ def sighting_changes(
     as_seen = place_of(azimuth)
     to_the_left = place_of(azimuth + np.pi / 2)
     path = motion.reference(motion.path_m)
-    yaw = motion.reference(motion.yaw_rad)
+    yaw = motion.turned
     height = motion.reference(motion.height_m)
 
     def after(at: Floats, place: Floats = as_seen) -> Floats:

@@ -31,6 +31,8 @@ BLOCKS = (12, 6)
 """Numbers of blocks of a stretch; the larger variance counts."""
 FEWEST_ROWS = 8
 ROUNDS = 4
+SOFT_ROUNDS = 4
+"""Rounds before them in which rows count less the farther they are; not of many candidates, for their cost."""
 OUTLYING = 6.0
 """Rows beyond so many robust sigmas of the fit are left out."""
 MOST_OUTLYING = 0.25
@@ -159,9 +161,11 @@ class RobustFit:
         offset = np.nanmean(stretch.y) if stretch.has_offset else 0.0
         y = np.where(usable, stretch.y - offset, 0.0)
         kept = usable & fitting
+        weights = kept.astype(np.float64)
         prior = np.zeros(len(A))
-        for _ in range(ROUNDS):
-            AH = np.swapaxes((A * kept[:, :, None]).conj(), 1, 2)  # (k, p, n)
+        soft_rounds = SOFT_ROUNDS if len(columns) == 1 else 0
+        for k in range(soft_rounds + ROUNDS):
+            AH = np.swapaxes((A * weights[:, :, None]).conj(), 1, 2)  # (k, p, n)
             information = AH @ A
             information[:, -1, -1] += prior
             inverse = np.linalg.pinv(information, hermitian=True)
@@ -176,11 +180,15 @@ class RobustFit:
                 prior = np.maximum(variance, 1e-24) / drift_sigma**2
             known = np.where(usable | ~usable.any(axis=1)[:, None], size, np.nan)
             robust = 1.5 * np.nanmedian(known, axis=1)
-            near = usable & (size <= OUTLYING * np.maximum(robust, 1e-12)[:, None])
+            robust = np.maximum(robust, 1e-12)[:, None]
+            near = usable & (size <= OUTLYING * robust)
             fewest = (1 - MOST_OUTLYING) * usable.sum(axis=1)
             is_most = near.sum(axis=1) >= fewest
             # where so many are far the model is wrong, not the rows
             kept = np.where(is_most[:, None], near, usable)
+            # far rows among few hide each other: at first they only count less
+            soft = robust / np.maximum(size, robust)
+            weights = soft * (usable & fitting) if k < soft_rounds else kept
         return cls(A, p, inverse, residuals, usable, kept)
 
     @property

@@ -18,8 +18,11 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 from .runs import (
     acting,
     compass,
+    fix_rows,
     fixed,
+    heading_rows,
     late,
+    level_vehicle,
     line_of,
     lines_of,
     names,
@@ -72,6 +75,64 @@ def test_a_compass_of_the_opposite_sense_is_found():
     stuck, *_ = heading_findings(compass(run, np.zeros_like))
     assert stuck.acts
     assert "it hardly turns where the gyros do" in stuck.text()
+
+
+def swaying(dvl_hz: float = 5.0) -> Sequence:
+    """A level vehicle that goes ahead and yaws to and fro in four seconds, with a compass."""
+    t = np.arange(0.0, 120.0, 0.02)
+    yaw_rad = 0.3 * np.sin(0.5 * np.pi * t)
+    ahead = np.outer(0.5 + 0.0 * t, [1.0, 0.0, 0.0])
+    run = level_vehicle(ahead, np.gradient(yaw_rad, t), 0)
+    run = replace(run, dvl=run.dvl.rows(slice(0, None, round(5.0 / dvl_hz))))
+    noise = 0.01 * np.random.default_rng(0).standard_normal(len(t) // 10)
+    heading = heading_rows(run.imu.stamps_ns[::10], yaw_rad[::10] + noise)
+    return replace(run, heading=heading)
+
+
+def test_two_wild_headings_turn_none_of_those_after_them():
+    """Their difference is more than half a turn, and shorter the other way round."""
+    run = swaying()
+    yaw_rad = run.heading.yaw_rad.copy()
+    yaw_rad[300:302] += [1.7, -1.7]
+    found, *_ = heading_findings(spoilt(run, "heading", yaw_rad=yaw_rad))
+    assert found.estimate.value == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("drift_rad_s", "named"), [(0.02, "gyro bias"), (0.5, "drift")]
+)
+def test_a_turn_that_no_bias_of_gyros_makes_is_the_headings(drift_rad_s, named):
+    """As degrees that are read as radians turn; a bias that they may have is theirs."""
+    run = swaying()
+    t = (run.heading.stamps_ns - run.heading.stamps_ns[0]) * 1e-9
+    turned = run.heading.yaw_rad + drift_rad_s * t
+    run = spoilt(run, "heading", yaw_rad=turned)
+    found = aiding_check.vertical_bias(run, BodyMotion.of(run))
+    assert found.grave
+    assert named in found.quantity
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.05])
+def test_turns_between_rows_of_a_slow_doppler_log_are_no_scale_of_the_gyros(scale):
+    """The vehicle yaws with a period of four rows."""
+    run = swaying(dvl_hz=1.0)
+    rate = scale * run.imu.angular_velocity
+    found, *_ = heading_findings(spoilt(run, "imu", angular_velocity=rate))
+    assert found.estimate.value == pytest.approx(1.0 / scale, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_few_fixes_far_off_among_few_of_a_vehicle_at_rest_are_no_contradiction(seed):
+    """Three of fifteen, which hide each other in a fit of all."""
+    sway = np.outer(0.02 * np.sin(0.004 * np.arange(1500)), [1.0, 0.0, 0.0])
+    run = level_vehicle(sway, np.zeros(1500), 0)
+    rng = np.random.default_rng(seed)
+    places = 0.3 * rng.standard_normal((15, 3))
+    far = rng.choice(15, 3, replace=False)
+    places[far, :2] += rng.uniform(-20.0, 20.0, (3, 2))
+    fixes = fix_rows(run.imu.stamps_ns[::100], places)
+    run = recalibrated(run, "positions", sigma_m=(0.3, 0.3, 0.3))
+    assert not acting(replace(run, positions=fixes))
 
 
 UNITS = [

@@ -165,6 +165,19 @@ def test_velocities_in_axes_of_the_world_are_named_before_all_else() -> None:
     assert "axes of the world" in first.text()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_velocities_of_the_world_are_named_where_turned_ones_fit_nearly(seed: int):
+    """A Doppler log that is turned by the course fits nearly as well; one in axes of the body is right."""
+    t = np.arange(0.0, 60.0, 0.02)
+    velocity = np.outer(0.5 + 0.4 * np.sin(1.2 * t + seed), [1.0, 0.0, 0.0])
+    yaw_rad = 0.7 + 0.6 * np.sin(0.3 * t + 2.0 * seed)
+    run = level_vehicle(velocity, np.gradient(yaw_rad, t), seed)
+    assert not acting(run)
+    turns = Rotation.from_euler("z", yaw_rad[::10, None])
+    first, *_ = grave(spoilt(run, "dvl", velocity=turns.apply(run.dvl.velocity)))
+    assert "axes of the world" in first.text()
+
+
 def test_rows_of_the_doppler_log_in_a_hole_of_the_imu_contradict_no_axes() -> None:
     run = without_imu(WORLD, 30.0, 55.0)
     assert found_axes(run) == (IDENTITY.tolist(), IDENTITY.tolist())

@@ -109,6 +109,8 @@ def climbing(climb_m_s: float) -> BodyMotion:
         height_m=climb_m_s * seconds,
         path_m=0.5 * seconds + 0j,
         ahead_m=0.5 * seconds,
+        imu_s=seconds,
+        imu_yaw_rad=zero,
     )
 
 
