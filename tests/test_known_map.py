@@ -1,5 +1,6 @@
 """Runs with a map of known landmarks: every estimator starts with it, and notices what moved."""
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -1049,8 +1050,38 @@ def test_heights_from_another_zero_are_named_with_what_to_add(dive, rise_m):
     (finding,) = map_findings(with_map(dive, mistaken, unknown_start(dive)))
     assert finding.acts
     assert "another zero than the depth" in finding.text()
-    told_m = float(finding.line.split()[1])
+    told_m = float(re.findall(r"[+-][0-9.]+", finding.line)[0])
     assert abs(told_m - rise_m) < 0.8
+
+
+@pytest.mark.parametrize("rise_m", [0.0, -0.5, 0.7])
+def test_a_tilted_sonar_shows_by_how_much_all_heights_are_off(dive, rise_m):
+    """They are within its aperture, but nearer landmarks stand elsewhere than the map has them."""
+    start = dive.calibration.start.pose()
+    angles = np.array([-0.6, 0.1, 0.6, -0.2, 0.3, 0.7, -0.7])
+    ranges_m = np.array([2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0])
+    level = ranges_m * [np.cos(angles), np.sin(angles)]
+    places = np.array([start.transformFrom(np.array([x, y, -3.0])) for x, y in level.T])
+    calibrated = dive.calibration.sonar
+    rpy_rad = (0.0, 0.7, 0.0)
+    sonar = calibrated.model_copy(
+        update={
+            "mounting": calibrated.mounting.model_copy(update={"rpy_rad": rpy_rad}),
+            "elevation_aperture_rad": 1.5,
+        }
+    )
+    seen = in_view(with_calibration_of(dive, sonar=sonar), places)
+    known = KnownMap.of(range(7), places - [0.0, 0.0, rise_m], sigma_m=SIGMA_M)
+    acting = [
+        f for f in map_findings(with_map(seen, known, unknown_start(dive))) if f.acts
+    ]
+    if not rise_m:
+        assert not acting
+        return
+    (finding,) = acting
+    assert "another zero than the depth" in finding.text()
+    told_m = float(re.findall(r"[+-][0-9.]+", finding.line)[0])
+    assert told_m == pytest.approx(rise_m, abs=0.25)
 
 
 @pytest.mark.parametrize("shown", [[1], [1, 2]])

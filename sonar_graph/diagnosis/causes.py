@@ -37,7 +37,6 @@ from sonar_graph.diagnosis.turn_rate import residual
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import NS_PER_S, Floats
 from sonar_graph.navigation.alignment import (
-    LONGEST_S,
     Estimate1D,
     align_in_motion,
     until_hole,
@@ -62,7 +61,8 @@ JUMPING = 2.0
 LONGEST_LIST = 3
 LARGEST_MISFIT = 10.0
 """Differences over their sigmas, beyond those of noise that is stated too small."""
-MOST_MINUTES = 3
+HALF_MINUTE_S = 30.0
+MOST_HALF_MINUTES = 6
 
 
 @dataclass(frozen=True)
@@ -403,20 +403,23 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
 
 
 def unlike_pair(sequence: Sequence) -> Finding | None:
-    """Doppler log and IMU that contradict each other in one of up to three minutes, by what no other comparison knows."""
+    """Doppler log and IMU that contradict each other in two of up to six half minutes, by what no other comparison knows.
+
+    A single wild velocity spoils no more than one of them.
+    """
     if np.isnan(sequence.imu.specific_force).all() or lacks_gravity(sequence):
         return None
     first_ns, *_, last_ns = sequence.imu.stamps_ns.tolist()
-    minute_ns = round(LONGEST_S * NS_PER_S)
-    count = int(np.clip((last_ns - first_ns) // minute_ns, 1, MOST_MINUTES))
-    begins_ns = np.linspace(first_ns, max(first_ns, last_ns - minute_ns), count)
+    step_ns = round(HALF_MINUTE_S * NS_PER_S)
+    count = int(np.clip((last_ns - first_ns) // step_ns, 2, MOST_HALF_MINUTES))
+    begins_ns = np.linspace(first_ns, max(first_ns, last_ns - step_ns), count)
     misfits = np.array([misfit_of(sequence, int(begin)) for begin in begins_ns])
     unlike = np.flatnonzero(misfits > LARGEST_MISFIT)
-    if not len(unlike):
+    if len(unlike) < 2:
         return None
     from_s = (begins_ns[unlike[0]] - first_ns) / NS_PER_S
     cause = (
-        f"in {len(unlike)} of {count} minutes, from {from_s:.0f} s on, velocities and accelerations differ up to "
+        f"in {len(unlike)} of {count} half minutes, from {from_s:.0f} s on, velocities and accelerations differ up to "
         f"{misfits.max():.0f} times more than their noise says; whether axes, stamps, scale or noise of either is wrong "
         "could not be found, and other sensors were not compared"
     )
@@ -426,8 +429,8 @@ def unlike_pair(sequence: Sequence) -> Finding | None:
 
 
 def misfit_of(sequence: Sequence, begin_ns: int) -> float:
-    """Differences of velocities and accelerations of a minute over their sigmas; 0 where they are usual, or too few."""
-    end_ns = begin_ns + round(LONGEST_S * NS_PER_S)
+    """Differences of velocities and accelerations of half a minute over their sigmas; 0 where they are usual, or too few."""
+    end_ns = begin_ns + round(HALF_MINUTE_S * NS_PER_S)
     calibration = sequence.calibration
     imu = without_bias(sequence.imu, calibration).between(begin_ns - 1, end_ns)
     dvl = sequence.dvl.between(begin_ns - 1, end_ns)

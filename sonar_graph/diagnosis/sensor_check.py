@@ -231,7 +231,7 @@ def are_wild(velocity: Floats) -> NDArray[np.bool_]:
     The scale is the median deviation of the five, or that of all rows where it is larger: rows at rest agree by chance.
     A wild row is also nearer to neither neighbour than they are to each other: a vehicle that begins to turn is not wild.
     """
-    padded = np.pad(velocity, ((2, 2), (0, 0)), mode="edge")
+    padded = np.pad(velocity, ((2, 2), (0, 0)), mode="reflect")
     five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)  # (n, 3, 5)
     middle = np.median(five, axis=2)
     off = np.abs(velocity - middle)

@@ -77,6 +77,8 @@ MORE_SHOWN = 0.25
 """Share of the sightings that the vertical aperture allows only with the other sign of the heights."""
 LEAST_SHOWN = 0.5
 """Share of the sightings that it allows with the right heights, at least: wrong identities and side lobes are fewer."""
+RISES_M = (-2.0, -1.4, -1.0, -0.7, -0.5, -0.3, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)
+"""Heights by which a tilted sonar shows that all landmarks are wrong; each is near enough to the ones between."""
 SIGMA_FACTORS = (10.0, 100.0)
 """Factors by which sigmas of a map may be too small."""
 WIDEST_M = 0.5
@@ -123,12 +125,9 @@ def map_fit(sequence: Sequence) -> MapFit:
         if evidence(exchanged) - evidence(negated) > math.log(CLEAR):
             return MapFit(None, NORTH_EAST_DOWN, remedy_of(known, T) + OR_FORWARD)
         return MapFit(start, NEGATED, remedy_of(known, Z_UP))
-    if rise_m:
-        raised = followed(sequence, moved_up(known, rise_m))
-        if evidence(raised) - evidence(given) > math.log(CLEAR):
-            return MapFit(start, OTHER_ZERO, f"add {rise_m:+.1f} m to each z_m")
     moved: list[int] = []
     elsewhere: tuple[int, ...] = ()
+    is_misfit = start is None
     of_each = newest_of_each(given.sightings, MOST_OF_LANDMARK)
     if start is not None:
         data = map_data(of_each, known)
@@ -137,8 +136,14 @@ def map_fit(sequence: Sequence) -> MapFit:
         moved = moved_landmarks(start, data)
         surely = surely_elsewhere(start, moved, data)
         elsewhere = tuple(sorted(known.ids[row] for row in surely))
+        is_misfit = bool(elsewhere) or misfits(start, data)
         if len(moved) >= len(start.agreeing):
             start = None
+    # a sonar that is tilted shows landmarks elsewhere by their heights
+    if is_misfit or rise_m:
+        common_m = common_rise(sequence, given, (*RISES_M, rise_m))
+        if common_m:
+            return MapFit(start, OTHER_ZERO, f"add about {common_m:+.1f} m to each z_m")
     # of a map with other axes a few landmarks fit somewhere, and some of the others in pairs
     before = 0 if moved and start is None else agreeing(given)
     seen = len(seen_rows(given))
@@ -161,7 +166,7 @@ def map_fit(sequence: Sequence) -> MapFit:
     if start is not None:
         gain = 0.0
         # beside landmarks that moved the others fit
-        if elsewhere and misfits(start, map_data(of_each, known)):
+        if elsewhere and misfits(start, data):
             looser = with_sigmas(known, SIGMA_FACTORS[0])
             gain = evidence(followed(sequence, looser)) - evidence(given)
         if rise_m or gain <= math.log(CLEAR):
@@ -303,16 +308,46 @@ def evidence(locator: MapLocator) -> float:
     return starts[0].log_evidence if starts else -math.inf
 
 
-def agreeing(locator: MapLocator) -> int:
-    """Number of landmarks that agree with the best start, by the newest sightings of each."""
+def by_all(locator: MapLocator) -> FoundStart | None:
+    """The best start by the newest sightings of each landmark; None without one."""
     newest = locator.newest()
     starts = candidates(map_data(newest, locator.map)) if newest else []
-    data = (
-        map_data(newest_of_each(locator.sightings, MOST_OF_LANDMARK), locator.map)
-        if newest
-        else None
-    )
-    best = refined(starts[0].parameters, data) if starts and data else None
+    if not starts:
+        return None
+    of_each = newest_of_each(locator.sightings, MOST_OF_LANDMARK)
+    return refined(starts[0].parameters, map_data(of_each, locator.map))
+
+
+def common_rise(
+    sequence: Sequence, given: MapLocator, rises_m: tuple[float, ...]
+) -> float:
+    """The height that all landmarks lack, m, as a tilted sonar shows; 0 where none makes more of them agree.
+
+    It must explain the sightings better than sigmas that are too small.
+    """
+    as_given = by_all(given)
+    looser = by_all(followed(sequence, with_sigmas(given.map, SIGMA_FACTORS[0])))
+    before = 0 if as_given is None else len(as_given.agreeing)
+    least = -math.inf if as_given is None else as_given.log_evidence
+    least += math.log(CLEAR)
+    if looser is not None:
+        least = max(least, looser.log_evidence)
+    found_m = 0.0
+    for rise_m in rises_m:
+        raised = followed(sequence, moved_up(given.map, rise_m))
+        best = by_all(raised)
+        if best is None or shown(given) - shown(raised) > MORE_SHOWN:
+            continue
+        is_more = len(best.agreeing) > before and best.log_evidence > least
+        if is_more and (as_given or gives_start(sequence, raised.map)):
+            least = best.log_evidence
+            found_m = rise_m
+    return found_m
+
+
+def agreeing(locator: MapLocator) -> int:
+    """Number of landmarks that agree with the best start."""
+    best = by_all(locator)
     return 0 if best is None else len(best.agreeing)
 
 
