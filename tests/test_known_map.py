@@ -285,7 +285,7 @@ def test_contradictions_within_seconds_that_show_no_place_are_refused_and_named(
     assert 0 in known.held
     line, _ = known.messages()
     assert (
-        "moved since the map was made: landmark 0: their sightings are refused" in line
+        "moved since the map was made: landmark 0: sightings are refused" in line
     )
 
 

@@ -419,10 +419,7 @@ def named_landmarks(messages: list[str]) -> set[int]:
     """Landmarks that messages name as moved, or as those that contradict the map."""
     named = set()
     for line in messages:
-        listed = re.search(
-            r"landmarks? ([0-9., ]+): (mapped|their sightings|sightings contradict)",
-            line,
-        )
+        listed = re.search(r"landmarks? ([0-9., ]+): (mapped|sightings)", line)
         for part in listed[1].split(", ") if listed else ():
             first, *rest = part.split("..")
             named |= set(range(int(first), int(rest[0] if rest else first) + 1))

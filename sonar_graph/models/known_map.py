@@ -184,7 +184,7 @@ class KnownLandmarks:
             whole = ", or give history.policy = whole to map them again"
             way_out = f"correct the map{'' if self._may_release else whole}"
             lines.append(
-                f"{MOVED}: {named(refused)}: their sightings are refused; {way_out}"
+                f"{MOVED}: {named(refused)}: sightings are refused; {way_out}"
             )
         if contradicted:
             # a few may agree by chance
