@@ -24,9 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.calibration import UNKNOWN_HEIGHT, KnownMap
-from sonar_graph.errors import LogError
+from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.files import replacing, text_of
 from sonar_graph.measurements import FIRST_TOO_LARGE_ID
+from sonar_graph.navigation import NO_MAP
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import parse, toml_value
 from sonar_graph.states import counted
@@ -215,11 +216,18 @@ def map_origin(sequence: Sequence) -> str:
     return f"{sequence.name} ({zlib.crc32(first.tobytes()):08x})"
 
 
-def in_map(sequence: Sequence, path: Path) -> Sequence:
-    """A sequence with the map of a file. Its start is found in the map where the log states no place.
+def in_map(sequence: Sequence, path: Path | None) -> Sequence:
+    """A sequence with the map of a file, or as it is. Its start is found in the map where the log states no place.
 
     The note ``log.map`` of the sequence describes what was done.
     """
+    if path is None:
+        if (
+            sequence.calibration.start.source == "map"
+            and sequence.calibration.map is None
+        ):
+            raise CalibrationError(NO_MAP)
+        return sequence
     known, warnings = read_map(path)
     given = sequence.calibration
     has_height = UNKNOWN_HEIGHT not in sequence.notes.get("log.start", "")

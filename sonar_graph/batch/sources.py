@@ -103,7 +103,7 @@ def _read_log(options: LogOptions) -> Sequence:
         window=TimeWindow.parse(options.start, options.end),
         salvage=options.salvage,
     )
-    return sequence if options.map is None else in_map(sequence, Path(options.map))
+    return in_map(sequence, Path(options.map) if options.map else None)
 
 
 def _check_log(options: LogOptions) -> None:

@@ -207,7 +207,7 @@ class ReadingOptions:
 
         # the map comes last: the start that the log states goes before one that is found in a map
         sequence = read_log(log, **self.of_log, salvage=self.salvage, progress=progress)
-        return sequence if self.map is None else in_map(sequence, self.map)
+        return in_map(sequence, self.map)
 
 
 def with_options(

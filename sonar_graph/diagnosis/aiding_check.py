@@ -765,8 +765,10 @@ LEAST_EXCURSION_RAD = np.radians(10.0)
 EXCURSION_SIGMAS = 3.0
 HIGHEST_M = 1.0
 """Height above the surface that waves and the weather give a pressure sensor there."""
+LEAST_FROM_START_M = 0.1
+"""Difference between the height of a start and that of the first depths, beyond their sigmas, that is told."""
 FARTHEST_FROM_START_M = 0.5
-"""Difference between the height of a start and that of the first depths that waves and a rough start make."""
+"""The same that waves and a rough start make: beyond it results are doubtful."""
 FIRST_ROWS = 5
 ATMOSPHERE_M = 10.1
 """Water that weighs as much as the air."""
@@ -837,7 +839,8 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     off_m = height_m - float(start.pose().transformFrom(port)[2])
     sigma_m = float(np.hypot(start.position_sigma_m[2], sensor.sigma_m))
     climbed_m = float(np.ptp(rows_m))
-    if abs(off_m) <= FARTHEST_FROM_START_M + climbed_m + ACTING_SIGMAS * sigma_m:
+    beyond_m = abs(off_m) - climbed_m - ACTING_SIGMAS * sigma_m
+    if beyond_m <= LEAST_FROM_START_M:
         return
     x, y, z = start.position_m
     of_air = ""
@@ -846,15 +849,19 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
             f"`atmosphere_pa = 0` under [depth] {IN_LOG_CONFIG} where pressures are counted from the surface, since so "
             "much water weighs as much as the air; "
         )
-    yield contradiction(
+    is_far = beyond_m > FARTHEST_FROM_START_M
+    right = f"`start.position_m = {numbers((x, y, z + off_m), 2)}` {IN_CALIBRATION} where the depths are right"
+    use = f"{unused('depth')} leaves the depths out, scale = -1 there is for depths downwards"
+    row = contradiction(
         "depth: distance from the start",
         cause=f"the height begins at {height_m:.2f} m, the start of the calibration is at {height_m - off_m:.2f} m: an "
         "altimeter, another sign, unit or origin, or a wrong start?",
-        line=f"{of_air}{unused('depth')} leaves the depths out, scale = -1 there is for depths downwards; "
-        f"`start.position_m = {numbers((x, y, z + off_m), 2)}` {IN_CALIBRATION} where the depths are right",
+        line=f"{of_air}{use}; {right}" if is_far else right,
         estimate=Estimate1D(off_m, sensor.sigma_m),
         unit="m",
     )
+    # a rough start, as long as the depths lead the estimators back
+    yield replace(row, gravity=gravity_of(is_far))
 
 
 def above_water(height_m: float, sigma_m: float) -> Finding:

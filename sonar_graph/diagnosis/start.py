@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
+    INTERVAL_SIGMAS,
     NO_NEED,
     Finding,
     gravity_of,
@@ -350,17 +351,21 @@ def tilt_findings(
     rows = list[Finding]()
     for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
         given = start.rpy_rad[axis]
+        off_rad = wrap_angle(angle.value - given)
+        allowed_rad = start.rpy_sigma_rad[axis]
         stated = f"the calibration's {np.degrees(given):+.2f}°"
+        is_near = abs(off_rad) <= INTERVAL_SIGMAS * np.hypot(angle.sigma, allowed_rad)
+        fits = "fits" if is_near else "differs by less than four of its sigmas"
         cause = f"{found.said}, not {stated}"
         quantity = f"start {name}: value"
         row = Finding(quantity, in_degrees(angle), "°", cause, line=line)
         of_row = judged(
             row,
-            replace(angle, value=wrap_angle(angle.value - given)),
+            replace(angle, value=off_rad),
             LEAST_TILT_RAD,
-            allowed=start.rpy_sigma_rad[axis],
+            allowed=allowed_rad,
             large=LARGE_TURN_RAD,
-            fits=f"{found.said}; {stated} fits, {NO_NEED}",
+            fits=f"{found.said}; {stated} {fits}, {NO_NEED}",
         )
         rows.append(of_row)
     return said_once(rows)

@@ -22,7 +22,7 @@ from sonar_graph.diagnosis.findings import (
     unknown,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.models import listed, wrap_angle
+from sonar_graph.models import listed, named, wrap_angle
 from sonar_graph.navigation import FoundStart, first_start, map_fit
 from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
@@ -61,11 +61,11 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
     if known is None or right.detections is None:
         return
     seen = set(right.detections.most_probable()[0].tolist())
-    named = {i for i in seen if 0 <= i < FIRST_ANONYMOUS_ID}
-    if named and named.isdisjoint(known.ids):
+    identities = {i for i in seen if 0 <= i < FIRST_ANONYMOUS_ID}
+    if identities and identities.isdisjoint(known.ids):
         yield contradiction(
             "map: identities",
-            f"none of the map's identities {listed(known.ids)} was seen; seen: {listed(named)}",
+            f"none of the map's identities {listed(known.ids)} was seen; seen: {listed(identities)}",
             "give the map of this place, with the identities of the log",
             "none in common",
         )
@@ -95,7 +95,7 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         turn = Estimate1D(wrap_angle(fit.start.parameters[0]), sigma)
         agreeing = [known.ids[row] for row in fit.start.agreeing]
         fits = f"the sightings of landmarks {listed(agreeing)} fit the map, {NO_NEED}"
-        if others := named.difference(known.ids):
+        if others := identities.difference(known.ids):
             fits += f"; not in it: {listed(others)}"
         yield Finding("map: yaw of the start in it", in_degrees(turn), "°", fits)
     if fit.rise_m:
@@ -113,8 +113,8 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         yield Finding(
             "map: landmarks elsewhere",
             unknown("they moved"),
-            cause=f"{listed(fit.elsewhere)} are seen several times in another place than the map has them: moved, wrong "
-            "lines of the survey, or heights from another zero",
+            cause=f"{named(fit.elsewhere)}: seen several times in another place than the map has: moved, wrong lines of "
+            "the survey, or heights from another zero",
             line="correct these lines of the map, or leave them out",
             gravity=Gravity.ACT,
         )

@@ -183,9 +183,7 @@ class KnownLandmarks:
         if refused:
             whole = ", or give history.policy = whole to map them again"
             way_out = f"correct the map{'' if self._may_release else whole}"
-            lines.append(
-                f"{MOVED}: {named(refused)}: sightings are refused; {way_out}"
-            )
+            lines.append(f"{MOVED}: {named(refused)}: sightings are refused; {way_out}")
         if contradicted:
             # a few may agree by chance
             is_sure = len(contradicted) > max(1, SURE_TIMES * len(self._agree()))

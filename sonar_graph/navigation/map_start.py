@@ -42,6 +42,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration, KnownMap, Start
+from sonar_graph.errors import CalibrationError
 from sonar_graph.estimator import (
     Estimator,
     MakeEstimator,
@@ -73,6 +74,10 @@ from sonar_graph.states import (
     Trajectory,
 )
 
+NO_MAP = (
+    'start.source = "map" in the calibration, and no map: give one with --map, or state `position_m` and `rpy_rad` under '
+    '[start] instead of `source = "map"`'
+)
 WRONG = 0.1
 """Probability of a wrong identity."""
 ODDS = 1e3
@@ -1008,5 +1013,7 @@ class StartInMap:
 def make_estimator(make: MakeEstimator, calibration: Calibration) -> Any:
     """Estimator with an odometry of its own, which waits for its start where that is to be found in the map."""
     if calibration.start.source == "map":
+        if calibration.map is None:
+            raise CalibrationError(NO_MAP)
         return StartInMap(make, calibration)
     return make(calibration, Odometry(calibration))

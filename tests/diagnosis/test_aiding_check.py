@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
 from sonar_graph.diagnosis import Finding, aiding_check, check_sensors
+from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.units import force_scale
 from sonar_graph.logs.adapters import LogConfig
@@ -259,26 +260,26 @@ def test_a_constant_bias_of_the_gyros_is_found_and_its_line_takes_it_away(
 
 
 @pytest.mark.parametrize(
-    ("z_m", "stated", "is_told"),
+    ("z_m", "stated", "gravity"),
     [
-        (-3.4, -3.0, False),
-        (-4.5, -3.0, True),
-        (3.0, -3.0, True),
-        (-50.0, None, False),
-        (0.5, None, False),
-        (1.5, None, True),
+        (-3.05, -3.0, None),
+        (-3.4, -3.0, Gravity.ACT),
+        (-4.5, -3.0, Gravity.GRAVE),
+        (3.0, -3.0, Gravity.GRAVE),
+        (-50.0, None, None),
+        (0.5, None, None),
+        (1.5, None, Gravity.ACT),
     ],
 )
 def test_heights_that_do_not_begin_at_the_stated_start_or_under_water_are_told(
-    z_m: float, stated: float | None, is_told: bool
+    z_m: float, stated: float | None, gravity: Gravity | None
 ):
     start = Start() if stated is None else Start(position_m=(5.0, 5.0, stated))
     heights_m = RIGHT.depth.z_m + z_m - float(RIGHT.depth.z_m[:5].mean())
     run = started(spoilt(RIGHT, "depth", z_m=heights_m), start)
     found = list(aiding_check.start_depth_findings(run))
-    assert [finding.acts for finding in found] == [True] * is_told
     # a height that nothing contradicts may be one over the bottom
-    assert [finding.grave for finding in found] == [stated is not None] * is_told
+    assert [one.gravity for one in found] == [gravity] * (gravity is not None)
     told = "above the water" if stated is None else f"height begins at {z_m:.2f} m"
     assert all(told in finding.advice for finding in found)
 

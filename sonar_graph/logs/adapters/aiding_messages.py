@@ -81,7 +81,7 @@ class HeadingAdapter(Adapter):
     def accepts(self, fault: str) -> str | None:
         """Setting with which messages that are left out for a fault are used; None without one."""
         if fault == NO_MEASUREMENT:
-            return "needs_variance = false, status = false"
+            return "needs_variance = false` and `status = false"
         return super().accepts(fault)
 
     def refusal(self, topic: Topic) -> str | None:

@@ -19,6 +19,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.files import as_path, text_of
 from sonar_graph.logs.adapters.adapter import UNITS, Adapter, did_you_mean, leaf_fields
@@ -62,8 +63,11 @@ class LogConfig:
         # what a table means depends on the type, which only the log may have
         for role, table in values.items():
             if role not in ADAPTERS:
+                fault = f"there is no role [{role}]"
+                if role in Calibration.model_fields:
+                    fault += ", which is a section of a calibration: give it with --calibration"
                 raise LogError(
-                    f"{source}: there is no role [{role}]; tables are for {', '.join(ADAPTERS)}"
+                    f"{source}: {fault}; tables are for {', '.join(ADAPTERS)}"
                 )
             if not isinstance(table, Mapping):
                 fault = f"expected a table, [{role}], not {table!r}"

@@ -113,10 +113,10 @@ class ImuAdapter(Adapter):
         found = self._signals(table)
         if found.denied:
             fields = " and ".join(str(getattr(self, key)) for key in found.denied)
-            keys = ", ".join(f"{key} = false" for key in found.denied)
+            keys = " and ".join(f"`{key} = false`" for key in found.denied)
             yield (
                 f"{fields} are -1 (not measured) in every message, and yet the values change: used as measured; "
-                f"`{keys}` under [imu] in a log configuration confirms it"
+                f"{keys} under [imu] in a log configuration confirms it"
             )
         names = ", ".join(self.linear_acceleration or ())
         bad = not_finite(found.force)
