@@ -541,7 +541,9 @@ class SensorComparison:
         is_right = abs(self.found.gain.value - 1.0) < STEP_GAIN_ERROR
         ratio = 1.0 if is_right and not self.is_late else STEP_RATIO
         unit = self.check.step_unit
-        steps = unit and step_text(self.found, self.sigma, unit, ratio)
+        # a turn that begins later is no step
+        found = self.found.in_time() if self.is_late else self.found
+        steps = unit and step_text(found, self.sigma, unit, ratio)
         if not steps:
             return None
         return self.contradiction(
@@ -890,7 +892,8 @@ def heading_findings(
         return
     bias_sigma_rad = right.calibration.heading.bias_sigma_rad
     least_rad = max(LEAST_EXCURSION_RAD, EXCURSION_SIGMAS * bias_sigma_rad)
-    if left := excursion(found, least_rad):
+    is_late = matters(found.lag, HEADING.least_lag_s)
+    if left := excursion(found.in_time() if is_late else found, least_rad):
         yield contradiction(
             "heading: excursion from that by the gyros",
             f"it leaves them {left} and comes back: a compass near iron, or an outage of its source",

@@ -134,6 +134,8 @@ from sonar_graph.sequence import Sequence
 
 YAW = "DVL mounting yaw"
 LEVEL_TURNS = ("DVL mounting roll", "DVL mounting pitch")
+DVL_SCALE = "DVL scale"
+GYRO_SCALE = "`angular_velocity_scale"
 TURNED = "velocity changes as the IMU measures, turned by as much"
 DVL_AXES = "DVL axes"
 WRONG_AXES = "wrong axes"
@@ -347,7 +349,8 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         up = np.median(motion.up, axis=0)
         of_heading = vertical_bias(right, motion)
         if of_heading is not None:
-            estimates = with_vertical(estimates, of_heading.estimate, up)
+            allowed = right.calibration.imu.gyro_bias_sigma
+            estimates = with_vertical(estimates, of_heading.estimate, up, allowed)
     D_heading = up * right.duration_s  # (3,)
     bias = bias_findings(estimates, sources, right.calibration.imu, D_heading)
     right, estimates = without_acting_bias(right, estimates)
@@ -389,6 +392,10 @@ def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
         axes = [f for f in axes if f not in tilting]
         by_motion = [f for f in by_motion if not f.quantity.endswith(DELAYS)]
         reference = [f for f in reference if f not in of_stamps]
+    if any(f.grave and GYRO_SCALE in f.line for f in by_motion):
+        # neither forces nor velocities fit turns of a wrong scale
+        axes = [f for f in axes if f not in tilting]
+        of_dvl = [f for f in of_dvl if f.quantity != DVL_SCALE or not f.acts]
     if any(f.quantity == YAW for f in axes):
         of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts]
     if no_arm:
@@ -847,7 +854,7 @@ def dvl_findings(
     turned = Finding(YAW, in_degrees(yaw), "°", cause, line=line)
     line = scale_line("dvl", "scale", config, 1.0 / found.scale.value)
     cause = "scale the DVL's velocities"
-    scaled = Finding("DVL scale", found.scale, cause=cause, line=line)
+    scaled = Finding(DVL_SCALE, found.scale, cause=cause, line=line)
     return [
         judged(late, offset, LEAST_OFFSET_S, large=LARGE_OFFSET_S),
         judged(turned, yaw, LEAST_YAW_RAD, large=LARGE_TURN_RAD),
@@ -960,8 +967,14 @@ def surest_bias(
     return (x, y, z), (of_x, of_y, of_z)
 
 
-def with_vertical(bias: Estimates3D, vertical: Estimate1D, up: Floats) -> Estimates3D:
-    """Biases with the weighted mean of both estimates about the vertical; as they are where these contradict each other."""
+def with_vertical(
+    bias: Estimates3D, vertical: Estimate1D, up: Floats, allowed: float
+) -> Estimates3D:
+    """Biases with the weighted mean of both estimates about the vertical.
+
+    Where these contradict each other they stay as they are, unless only the heading shows a bias that the calibration's
+    sigma, ``allowed``, has: in a steady circle velocities and forces hardly show one.
+    """
     if not vertical.is_known or not all(one.is_known for one in bias):
         return bias
     axis = int(np.argmax(np.abs(up)))
@@ -969,9 +982,11 @@ def with_vertical(bias: Estimates3D, vertical: Estimate1D, up: Floats) -> Estima
     beside = sum(one.value * up[k] for k, one in enumerate(bias) if k != axis)
     by_heading = (vertical.value - beside) / up[axis]
     apart = replace(vertical, value=by_heading - before.value)
-    if matters(apart, LEAST_BIAS_RAD_S, before.sigma):
-        return bias
     both = weighted([(before.value, before.sigma), (by_heading, vertical.sigma)])
+    if matters(apart, LEAST_BIAS_RAD_S, before.sigma):
+        both = replace(vertical, value=by_heading)
+        if matters(both, LEAST_BIAS_RAD_S, allowed):
+            return bias
     x, y, z = (both if k == axis else one for k, one in enumerate(bias))
     return x, y, z
 

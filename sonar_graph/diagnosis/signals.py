@@ -73,6 +73,10 @@ class SignalStretch:
         """What the sensor has beyond its reference, ``y - x``, as a signal of its own."""
         return replace(self, y=self.y - self.x)
 
+    def delayed(self, lag_s: float) -> "SignalStretch":
+        """The same with a reference that comes later."""
+        return replace(self, reference=lambda t: self.reference(t - lag_s))
+
     def shifted(self, lags_s: Floats) -> Values:
         """Reference at the rows for each lag, shape (k, n)."""
         at = self.seconds - lags_s[:, None]
@@ -108,6 +112,11 @@ class Match:
     """What was compared."""
     whole: tuple[SignalStretch, ...] = ()
     """The same in one piece for each part of the log."""
+
+    def in_time(self) -> "Match":
+        """The same with the sensor's delay taken off what is in one piece."""
+        lag_s = self.lag.value if self.lag.is_known else 0.0
+        return replace(self, whole=tuple(one.delayed(lag_s) for one in self.whole))
 
     def less_certain(self, sigma: float) -> "Match":
         """The same with an error of the gain by what the comparison leaves out."""

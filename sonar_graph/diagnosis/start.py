@@ -113,7 +113,14 @@ def without_bias(imu: Imu, calibration: Calibration) -> Imu:
 def accel_bias_findings(
     found: DvlMatch, calibration: Calibration
 ) -> tuple[list[Finding], Calibration]:
-    """A row for each axis on which the accelerometers' bias is beyond its sigma, and the calibration with it."""
+    """A row for each axis on which the accelerometers' bias is beyond its sigma, and the calibration with it.
+
+    A large one along the vertical would change the size of gravity, which `force_scale` compares: it is none, and shows
+    that the turns are wrong.
+    """
+    *_, upward = found.accel_bias
+    if matters(upward, LARGE_ACCEL_BIAS_M_S2):
+        return [], calibration
     imu = calibration.imu
     allowed = imu.accel_bias_sigma
     body_R_imu = imu.mounting.pose().rotation().matrix()

@@ -90,6 +90,19 @@ def swaying(dvl_hz: float = 5.0) -> Sequence:
     return replace(run, heading=heading)
 
 
+def test_a_late_compass_of_a_vehicle_that_turns_back_at_once_has_not_jumped():
+    """Where the turn is reversed, a late heading leaves the gyros within a row."""
+    t = np.arange(0.0, 120.0, 0.02)
+    rate = 0.8 * np.tanh(4.0 * np.sin(0.15 * t))
+    run = level_vehicle(np.zeros((len(t), 3)), rate, 0)
+    yaw_rad = np.cumsum(rate) * 0.02
+    noise = 0.01 * np.random.default_rng(0).standard_normal(len(t) // 10)
+    heading = heading_rows(run.imu.stamps_ns[::10], yaw_rad[::10] + noise)
+    (found,) = acting(late(replace(run, heading=heading), "heading", 0.6))
+    assert found.quantity == "heading against the gyros: delay"
+    assert line_of(found)["stamp_offset_s"] == pytest.approx(-0.6, abs=0.02)
+
+
 def test_two_wild_headings_turn_none_of_those_after_them():
     """Their difference is more than half a turn, and shorter the other way round."""
     run = swaying()

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PositionCalibration, Start
-from sonar_graph.diagnosis.causes import velocity_steps
+from sonar_graph.diagnosis.causes import unlike_pair, velocity_steps
 from sonar_graph.measurements import Depth, Floats, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
@@ -187,6 +187,16 @@ def test_velocities_of_another_vehicle_are_doubtful_also_after_a_rest(rest_s: fl
     (found,) = acting(replace(own, dvl=other.dvl))
     assert found.grave
     assert found.quantity == "DVL against IMU: velocities and accelerometers"
+
+
+def test_a_single_wild_velocity_contradicts_no_accelerometers():
+    own = level_vehicle(wandering(0), np.zeros(3500), 1)
+    assert unlike_pair(own) is None
+    velocity = own.dvl.velocity.copy()
+    velocity[100] += [2.0, -1.0, 1.0]
+    assert unlike_pair(spoilt(own, "dvl", velocity=velocity)) is None
+    velocity[250] += [2.0, -1.0, 1.0]
+    assert unlike_pair(spoilt(own, "dvl", velocity=velocity)) is not None
 
 
 def straight(scale: float) -> Sequence:

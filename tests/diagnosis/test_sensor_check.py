@@ -433,6 +433,22 @@ def test_a_mounting_that_is_not_known_is_named_before_what_may_follow() -> None:
     assert not list(sensor_check.unplaced_findings(replace(run, notes=notes), harmless))
 
 
+@pytest.mark.parametrize(
+    ("by_drive", "by_heading", "expected"),
+    [(-0.008, 0.0, 0.0), (0.0, 0.05, 0.0), (0.02, 0.05, 0.02), (0.011, 0.01, 0.0102)],
+)
+def test_a_bias_that_the_calibration_has_outranks_one_that_it_has_not(
+    by_drive: float, by_heading: float, expected: float
+):
+    """By the drive in a circle with gaps, or by a compass that drifts; where both have one that it has not, the drive's."""
+    none = Estimate1D(0.0, 1e-4)
+    drive = (none, none, Estimate1D(by_drive, 1e-3))
+    heading = Estimate1D(by_heading, 5e-4)
+    up = np.array([0.0, 0.0, 1.0])
+    *_, z = sensor_check.with_vertical(drive, heading, up, allowed=1e-4)
+    assert z.value == pytest.approx(expected, abs=1e-4)
+
+
 def test_imu_stamps_of_a_wrong_clock_have_one_line() -> None:
     """All other sensors look late, each by another time."""
     stamps_ns = RIGHT.imu.stamps_ns

@@ -154,7 +154,7 @@ def test_an_imu_that_denies_all_that_it_measures_is_used_with_a_warning(
     assert len(sequence.imu.stamps_ns) == ROWS
     assert np.isfinite(sequence.imu.specific_force).all()
     assert (
-        "`angular_velocity_status = false, linear_acceleration_status = false`"
+        "`angular_velocity_status = false` and `linear_acceleration_status = false`"
         in sequence.notes["log.warnings"]
     )
 
