@@ -232,7 +232,19 @@ def are_wild(velocity: Floats) -> NDArray[np.bool_]:
 
     The scale is the median deviation of the five, or that of all rows where it is larger: rows at rest agree by chance.
     A wild row is also nearer to neither neighbour than they are to each other: a vehicle that begins to turn is not wild.
+    The second time wild rows are as the median, so that of two beside each other both are found.
     """
+    steady = velocity.copy()
+    is_wild = np.zeros(len(velocity), dtype=np.bool_)
+    for _ in range(2):
+        found, middle = wild_rows(steady)
+        steady[found] = middle[found]
+        is_wild |= found
+    return is_wild
+
+
+def wild_rows(velocity: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Rows that are wild beside their neighbours, shape (n,), and the medians of five, shape (n, 3)."""
     padded = np.pad(velocity, ((2, 2), (0, 0)), mode="reflect")
     five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)  # (n, 3, 5)
     middle = np.median(five, axis=2)
@@ -248,7 +260,8 @@ def are_wild(velocity: Floats) -> NDArray[np.bool_]:
         np.linalg.norm(velocity - before, axis=1),
         np.linalg.norm(velocity - after, axis=1),
     )
-    return np.asarray(is_far & (nearest > np.linalg.norm(after - before, axis=1)))
+    is_alone = nearest > np.linalg.norm(after - before, axis=1)
+    return np.asarray(is_far & is_alone), np.asarray(middle)
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:

@@ -474,5 +474,9 @@ def test_a_vehicle_that_begins_to_turn_is_not_wild_and_a_single_row_is() -> None
         ]
     )
     assert not sensor_check.are_wild(velocity).any()
+    steady = np.full((20, 3), [0.5, 0.05, -0.1])
+    steady[8:10] = [[0.6, -1.9, 1.7], [-2.2, 0.3, -1.5]]
+    steady[-1] = [0.75, 0.17, 2.0]
+    assert np.flatnonzero(sensor_check.are_wild(steady)).tolist() == [8, 9, 19]
     velocity[4] += [0.0, -1.5, 0.4]
     assert np.flatnonzero(sensor_check.are_wild(velocity)).tolist() == [4]
