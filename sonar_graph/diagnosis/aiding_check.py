@@ -1086,8 +1086,9 @@ def position_findings(
         yield contradiction(
             "position fixes: jumps",
             cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart move {times:.3g} times as much as the vehicle by its Doppler "
-            "log, beyond their noise: angles, another scale, or of another thing?",
-            line=f"{unused('positions')} leaves them out; or they are worse than `positions.sigma_m` {IN_CALIBRATION}",
+            "log, beyond their noise: worse than stated, angles, another scale, or of another thing?",
+            line=f"a larger `positions.sigma_m` {IN_CALIBRATION} where they are worse; {unused('positions')} leaves them "
+            "out",
             estimate=Estimate1D(100 * share, 100 * sigma),
             unit="%",
         )
