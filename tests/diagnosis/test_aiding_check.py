@@ -93,7 +93,7 @@ def swaying(dvl_hz: float = 5.0) -> Sequence:
 def test_a_late_compass_of_a_vehicle_that_turns_back_at_once_has_not_jumped():
     """Where the turn is reversed, a late heading leaves the gyros within a row."""
     t = np.arange(0.0, 120.0, 0.02)
-    rate = 0.8 * np.tanh(4.0 * np.sin(0.15 * t))
+    rate = np.tanh(20.0 * np.sin(0.1 * t))
     run = level_vehicle(np.zeros((len(t), 3)), rate, 0)
     yaw_rad = np.cumsum(rate) * 0.02
     noise = 0.01 * np.random.default_rng(0).standard_normal(len(t) // 10)
