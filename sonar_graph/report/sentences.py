@@ -215,7 +215,7 @@ def _worth_of_covariances(comparison: Comparison, name: str) -> str:
         return f"Its covariances are {fault} (NEES {' and '.join(misfits)}, 1 fits)."
     if any(verdicts):
         return "Its covariances fit its errors."
-    return "One run is too short to judge its covariances."
+    return "Its errors do not contradict its covariances; one run cannot confirm them."
 
 
 def published_filters(comparison: Comparison) -> str:
