@@ -410,10 +410,13 @@ def unlike_pair(sequence: Sequence) -> Finding | None:
     if np.isnan(sequence.imu.specific_force).all() or lacks_gravity(sequence):
         return None
     first_ns, *_, last_ns = sequence.imu.stamps_ns.tolist()
-    step_ns = round(HALF_MINUTE_S * NS_PER_S)
-    count = int(np.clip((last_ns - first_ns) // step_ns, 2, MOST_HALF_MINUTES))
-    begins_ns = np.linspace(first_ns, max(first_ns, last_ns - step_ns), count)
-    misfits = np.array([misfit_of(sequence, int(begin)) for begin in begins_ns])
+    # windows of a shorter log are its halves: a row must not be in two of them
+    step_ns = min(round(HALF_MINUTE_S * NS_PER_S), (last_ns - first_ns) // 2)
+    count = int(np.clip((last_ns - first_ns) // max(step_ns, 1), 2, MOST_HALF_MINUTES))
+    begins_ns = np.linspace(first_ns, last_ns - step_ns, count)
+    misfits = np.array(
+        [misfit_of(sequence, int(begin), step_ns) for begin in begins_ns]
+    )
     unlike = np.flatnonzero(misfits > LARGEST_MISFIT)
     if len(unlike) < 2:
         return None
@@ -428,9 +431,9 @@ def unlike_pair(sequence: Sequence) -> Finding | None:
     return contradiction(quantity, cause, line, "they contradict each other")
 
 
-def misfit_of(sequence: Sequence, begin_ns: int) -> float:
-    """Differences of velocities and accelerations of half a minute over their sigmas; 0 where they are usual, or too few."""
-    end_ns = begin_ns + round(HALF_MINUTE_S * NS_PER_S)
+def misfit_of(sequence: Sequence, begin_ns: int, step_ns: int) -> float:
+    """Differences of velocities and accelerations of a window over their sigmas; 0 where they are usual, or too few."""
+    end_ns = begin_ns + step_ns
     calibration = sequence.calibration
     imu = without_bias(sequence.imu, calibration).between(begin_ns - 1, end_ns)
     dvl = sequence.dvl.between(begin_ns - 1, end_ns)
