@@ -34,7 +34,6 @@ from baselines.events import (
     Motion,
     Sonar,
     Views,
-    elevation_of_new,
     feel,
     in_frame,
     is_followed,
@@ -43,24 +42,10 @@ from baselines.events import (
     shows_new,
 )
 from baselines.filter import FilterParams, FilterShell
-from baselines.kalman import (
-    GATED,
-    correction,
-    judged,
-    polar_covariance,
-    stands_on_floor,
-    symmetric,
-    view_noise,
-    write_judged,
-)
+from baselines.kalman import correction, correction_by_view, view_noise
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
-from sonar_graph.models import (
-    Mount,
-    locate_from_body,
-    sight_of,
-    wrap_angle,
-)
+from sonar_graph.models import Mount, sight_of, wrap_angle
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import (
     O3,
@@ -188,19 +173,6 @@ def pose_arrays(x: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
 
 
 @compiled
-def pose_estimate(
-    x: Floats, P: Floats, motion: Motion
-) -> tuple[Floats, Floats, Floats]:
-    """R', X' and the covariance ``T P_vv T^T + C`` of delta, shapes (3, 3), (3,) and (6, 6)."""
-    after = pose_after(x, motion)
-    R = np.empty((3, 3))
-    covariance = np.empty((6, 6))
-    store(after.R, R)
-    store6(after.T @ mat6(P) @ after.T.T + mat6(motion.C), covariance)
-    return R, np.array([after.X.x, after.X.y, after.X.z]), covariance
-
-
-@compiled
 def predict(x: Floats, P: Floats, motion: Motion) -> None:
     """Carry state and covariance over a motion: ``P_vv <- F P_vv F^T + G C G^T``, ``P_vm <- F P_vm``."""
     R, X, T = pose_after(x, motion)
@@ -252,25 +224,17 @@ def observe(
         if views.slot[row] == UNKNOWN:
             return row
         at = MAP + LANDMARK * views.slot[row]
-        z = views.z[row]
-        R_z = views.R_z[row]
         R, X, T = pose_after(x, motion)
         sight = sight_of(R, X, mount, Vec3(x[at], x[at + 1], x[at + 2]))  # (6)
-        turned_rad = wrap_angle(z[1] - sight.azimuth_rad)
-        e = np.array([z[0] - sight.range_m, turned_rad])  # (7)
         H = np.zeros((2, len(x)))
         # H_b T and H_p, row by row
         store_row6(T.T @ sight.range_by_body, H, 0, 0)
         store_row6(T.T @ sight.azimuth_by_body, H, 1, 0)
         store_row(sight.range_by_point, H, 0, at)
         store_row(sight.azimuth_by_point, H, 1, at)
-        noise = view_noise(sight, motion, R_z)
-        HP, S = innovation_of(P, H, noise)
-        # the kernel widens the noise of the detection, not that of the motion
-        outcome, widened = judged(e, S, R_z, views.gate[row], sonar.kernel_width)
-        if outcome != GATED:
-            move(x, correction(P, HP, S + widened, e))
-        write_judged(views, row, outcome, e, S)
+        noise = view_noise(sight, motion, views.R_z[row])
+        by = correction_by_view(P, H, sight, noise, views, row, sonar.kernel_width)
+        move(x, by)
     return NO_ROW
 
 
@@ -394,37 +358,21 @@ class EkfSlam(FilterShell):
         """Update by range and azimuth of known landmarks, (6) and (7)."""
         return observe(self._x, self._P, motion, self.sonar, views, first)
 
-    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
-        """Append a landmark ``p = g(x_v, z, elevation)`` to (4) and (5), on a floor of known height if it is near.
-
-        ``P_pv = G_v P_v.``,  ``P_pp = G_v P_vv G_v^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``.
-        """
-        x = self._x
-        P = self._P
-        sonar = self.sonar
-        R, X, T = pose_arrays(x, motion)
-        p, G_b, G_z = locate_from_body(
-            R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z)
-        )
-        G_v = G_b @ T
-        P_pv = G_v @ P[:POSE]  # (3, n)
-        P_pp = P_pv[:, :POSE] @ G_v.T + G_b @ motion.C @ G_b.T
-        P_pp += G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-        self._x = np.concatenate((x, p))
-        self._P = np.block([[P, P_pv.T], [P_pv, symmetric(P_pp)]])
-        if stands_on_floor(p[2], P_pp[2, 2], sonar):
-            self._update_numbers(
-                [len(x) + 2],
-                np.array([sonar.floor_z_m - p[2]]),
-                [sonar.floor_variance_m2],
-            )
+    def append(self, place: Floats, P: Floats) -> int:
+        """Append a landmark to (4)."""
+        self._x = np.concatenate((self._x, place))
+        self._P = P
+        return (len(self._x) - MAP) // LANDMARK - 1
 
     def linearised(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """R', X', and T as derivative by the whole state."""
-        R, X, T = pose_arrays(self._x, motion)
-        J = np.zeros((POSE, len(self._x)))
-        J[:, :POSE] = T
-        return R, X, J
+        """R', X', and T."""
+        return pose_arrays(self._x, motion)
+
+    def height_jacobian(self, slot: int) -> Floats:
+        """Derivative of a landmark's height by (4)."""
+        H = np.zeros((1, len(self._x)))
+        H[0, self.place_of(slot).stop - 1] = 1.0
+        return H
 
     def covariance(self) -> Floats:
         """P of (5)."""
@@ -447,7 +395,7 @@ class EkfSlam(FilterShell):
         """Update roll and pitch by the direction of the world's up in the body."""
         # roll is as uncertain as the pitch is steep
         level = math.hypot(up[1], up[2])
-        roll_off = wrap_angle(math.atan2(up[1], up[2]) - float(self._x[ROLL]))
+        roll_off = wrap_angle(math.atan2(up[1], up[2]) - self._x[ROLL])
         e = np.array([roll_off, math.atan2(-up[0], level) - self._x[PITCH]])
         self._update_numbers([ROLL, PITCH], e, [(sigma_rad / level) ** 2, sigma_rad**2])
 
@@ -466,10 +414,6 @@ class EkfSlam(FilterShell):
         H = np.zeros((len(places), len(self._x)))
         H[range(len(places)), places] = 1.0
         self.correct(H, e, np.diag(variances))
-
-    def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        return pose_estimate(self._x, self._P, motion)
 
     def points(self, slots: list[int]) -> tuple[Floats, Floats]:
         """Positions, and their blocks of (5)."""

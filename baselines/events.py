@@ -10,7 +10,6 @@ no later::
     t' ------ i                  position fix that comes late, by the motion backwards
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -128,26 +127,6 @@ def shows_new(views: Views, first: int) -> bool:
         if views.slot[row] == UNKNOWN:
             return True
     return False
-
-
-@compiled
-def read_detections(
-    range_m: Floats, azimuth_rad: Floats, logged: Floats, R_z: Floats
-) -> tuple[Floats, Floats]:
-    """Columns z and R_z of `Views`. Covariances are made symmetric, and are R_z where the log has none."""
-    z = np.empty((len(range_m), 2))
-    noise = np.empty((len(range_m), 2, 2))
-    for k in range(len(z)):
-        z[k, 0] = range_m[k]
-        z[k, 1] = azimuth_rad[k]
-        # a covariance off symmetry by rounding is made symmetric
-        across = 0.5 * (logged[k, 0, 1] + logged[k, 1, 0])
-        is_known = not math.isnan(logged[k, 0, 0] + across + logged[k, 1, 1])
-        noise[k, 0, 0] = logged[k, 0, 0] if is_known else R_z[0, 0]
-        noise[k, 1, 1] = logged[k, 1, 1] if is_known else R_z[1, 1]
-        noise[k, 0, 1] = across if is_known else R_z[0, 1]
-        noise[k, 1, 0] = noise[k, 0, 1]
-    return z, noise
 
 
 class Felt(NamedTuple):

@@ -31,13 +31,21 @@ from baselines.events import (
     Samples,
     Sonar,
     Views,
+    elevation_of_new,
     in_frame,
     in_order,
-    motion_to,
-    read_detections,
     remove_rate,
 )
-from baselines.kalman import GATED, NEW, Judged, distance, judged_far, symmetric
+from baselines.kalman import (
+    GATED,
+    NEW,
+    Judged,
+    distance,
+    judged_far,
+    polar_covariance,
+    stands_on_floor,
+    symmetric,
+)
 from sonar_graph.calibration import (
     Calibration,
     KnownMap,
@@ -65,6 +73,7 @@ from sonar_graph.models import (
     huber_scale,
     identify,
     locate_from_body,
+    polar_measurements,
     tilt_sigma,
     up_direction,
     wrap_angle,
@@ -72,7 +81,7 @@ from sonar_graph.models import (
 )
 from sonar_graph.motion import MotionSource, PreintegratedMotion, require_source
 from sonar_graph.navigation.alignment import earth_rate_in_world
-from sonar_graph.numerics import vec
+from sonar_graph.numerics import diagonal_blocks, vec
 from sonar_graph.states import (
     OUTCOME_NUMBERS,
     CausalEstimates,
@@ -169,8 +178,6 @@ class FilterShell(ABC):
         """Of the constant bias of the compass, at the start."""
         self.node_ns = 0
         """Stamp of the newest epoch, that of the state."""
-        sonar = calibration.sonar
-        self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
         self._interval_ns = (
             round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0
         )
@@ -195,8 +202,6 @@ class FilterShell(ABC):
         ids = calibration.map.ids if calibration.map else ()
         self._slots = {landmark_id: slot for slot, landmark_id in enumerate(ids)}
         """Number in the state of each landmark; those of the map come first."""
-        self._landmarks = len(ids)
-        """Number of landmarks in the state; some may have been let go."""
         self._journal = DetectionJournal()
         self._estimates = CausalEstimates()
         self._refused: list[RefusedRow] = []
@@ -221,12 +226,19 @@ class FilterShell(ABC):
         """
 
     @abstractmethod
-    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
-        """Append a landmark seen for the first time, a motion after the state."""
+    def append(self, place: Floats, P: Floats) -> int:
+        """Append a landmark at a place of the world, with the covariance P of the longer state; its number in it."""
 
     @abstractmethod
     def linearised(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """Pose a motion after the state, (3, 3) and (3,), and J, derivative of its [theta, rho] by the state, (6, n)."""
+        """Pose a motion after the state, (3, 3) and (3,), and J, derivative of its [theta, rho], shape (6, k).
+
+        By the first k numbers of the state, which are those that are no landmarks.
+        """
+
+    @abstractmethod
+    def height_jacobian(self, slot: int) -> Floats:
+        """Derivative of a landmark's height by the state, shape (1, n)."""
 
     @abstractmethod
     def covariance(self) -> Floats:
@@ -253,10 +265,6 @@ class FilterShell(ABC):
         """Update by the plane on which the vehicle stays."""
 
     @abstractmethod
-    def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-
-    @abstractmethod
     def points(self, slots: list[int]) -> tuple[Floats, Floats]:
         """Positions of m landmarks by their numbers in the state, (m, 3), and their joint covariance, (3 m, 3 m)."""
 
@@ -276,6 +284,44 @@ class FilterShell(ABC):
         """Estimated gyro bias, shape (3,), rad/s; zero where the state has none."""
         return NO_BIAS
 
+    # ---------------------------------------------------------------- pose, and what is seen from there
+
+    def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
+        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
+        R, X, J = self.linearised(motion)
+        k = J.shape[1]
+        A = J @ self.covariance()[:k, :k] @ J.T + motion.C
+        return R, X, 0.5 * (A + A.T)
+
+    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> int:
+        """Append a landmark ``p = g(x_v, z, elevation)``, seen a motion after the state; its number in the state.
+
+        ``P_pv = G P``,  ``P_pp = G P G^T + G_b C G_b^T + G_z diag(R_z, elevation_sigma^2) G_z^T``. It is put on a floor
+        of known height if it is near.
+        """
+        sonar = self.sonar
+        R, X, J = self.linearised(motion)
+        elevation_rad = elevation_of_new(R, X, sonar, z)
+        p, G_b, G_z = locate_from_body(R, X, sonar.mount, z, elevation_rad)
+        P = self.covariance()
+        G = self.by_point(self._by_state(G_b, J))
+        P_pv = G @ P  # (3, n)
+        P_pp = P_pv @ G.T + G_b @ motion.C @ G_b.T
+        P_pp += G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
+        slot = self.append(p, np.block([[P, P_pv.T], [P_pv, symmetric(P_pp)]]))
+        H = self.height_jacobian(slot)
+        variance_m2 = (H @ self.covariance() @ H.T)[0, 0]
+        if stands_on_floor(p[2], variance_m2, sonar):
+            off_m = np.array([sonar.floor_z_m - p[2]])
+            self.correct(H, off_m, np.array([[sonar.floor_variance_m2]]))
+        return slot
+
+    def _by_state(self, H_b: Floats, J: Floats) -> Floats:
+        """``H_b J``, by the whole state, shape (m, n)."""
+        H = np.zeros((len(H_b), len(self.covariance())))
+        H[:, : J.shape[1]] = H_b @ J
+        return H
+
     # ---------------------------------------------------------------- measurements that the paper has not
 
     def observe_far(
@@ -289,7 +335,7 @@ class FilterShell(ABC):
         P = self.covariance()
         g, G_b, G_z = locate_from_body(R, X, self.sonar.mount, z, 0.0)
         e = g - self.points([slot])[0][0]
-        H = -self.by_point(G_b @ J)
+        H = -self.by_point(self._by_state(G_b, J))
         H[:, self.place_of(slot)] += np.eye(3)  # e is the point seen less p
         noise = G_b @ motion.C @ G_b.T
         found, R_g = judged_far(e, H @ P @ H.T, noise, G_z, self.sonar, z, R_z)
@@ -308,7 +354,7 @@ class FilterShell(ABC):
         P = self.covariance()
         yaw, by_turn = yaw_and_derivative(R)
         H_b = np.array([[*by_turn, 0.0, 0.0, 0.0]])
-        H = H_b @ J
+        H = self._by_state(H_b, J)
         noise = H_b @ motion.C @ H_b.T
         e = np.array([wrap_angle(yaw_rad - yaw)])
         # judged without the estimated c: a filter that is wrong takes its error for one of the compass
@@ -328,7 +374,7 @@ class FilterShell(ABC):
         """Update by the position of the antenna, ``X' + R' q``, with Huber's kernel; its distance in sigmas."""
         R, X, J = self.linearised(motion)
         H_b = body_point_jacobian(R, self.antenna)  # (3, 6)
-        H = H_b @ J
+        H = self._by_state(H_b, J)
         e = position_m - (X + R @ self.antenna)
         noise = H_b @ motion.C @ H_b.T
         S = symmetric(H @ self.covariance() @ H.T + noise + cov_m2)
@@ -392,8 +438,7 @@ class FilterShell(ABC):
         """Landmarks in the state, with the covariances of their coordinates."""
         ids = sorted(self._slots)
         positions, joint = self.points([self._slots[i] for i in ids])
-        m = len(ids)
-        blocks = joint.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)]
+        blocks = diagonal_blocks(joint, 3)
         return self._known.with_given(
             LandmarkMap(np.array(ids, dtype=np.int64), positions, blocks)
         )
@@ -444,15 +489,13 @@ class FilterShell(ABC):
         if stamps_ns[0] < since_ns:
             outcome[stamps_ns < since_ns] = OUTCOME_NUMBERS[Outcome.LATE]
             outcome[stamps_ns < self._reached_ns] = OUTCOME_NUMBERS[Outcome.UNLOCATED]
-        z, R_z = read_detections(
-            np.ascontiguousarray(detections.range_m),
-            np.ascontiguousarray(detections.azimuth_rad),
-            detections.range_azimuth_cov,
-            self._R_z,
-        )
+        z, R_z = polar_measurements(detections, self.calibration.sonar)
         wanted = ids.tolist()
         slot = np.array([self._slots.get(each, UNKNOWN) for each in wanted])
-        gate = np.array([self._gate(each) for each in wanted])
+        # the gate of the map also for one that has moved: of two objects with its identity only one is mapped again
+        of_map = self._known.held.union(self._known.moved)
+        narrow = min(self.sonar.gate, self._known.gate)
+        gate = np.array([narrow if i in of_map else self.sonar.gate for i in wanted])
         e = np.full(z.shape, math.nan)
         S = np.full(R_z.shape, math.nan)
         return Views(stamps_ns, ids, slot, gate, z, R_z, outcome, e, S)
@@ -542,9 +585,7 @@ class FilterShell(ABC):
                 )
             else:
                 reason = Refusal.LATE if is_sound[row] else Refusal.UNSOUND
-                self._refused.append(
-                    RefusedRow(SENSORS[kind], stamp_ns, reason, math.nan)
-                )
+                self._refused.append(RefusedRow(SENSORS[kind], stamp_ns, reason))
         return _rows(samples, is_used)
 
     # ---------------------------------------------------------------- events of a call
@@ -609,7 +650,7 @@ class FilterShell(ABC):
 
     def _motion_to(self, events: Events, k: int) -> Motion:
         """Motion to an event without the gyro bias of the state and the Earth's rate."""
-        motion = motion_to(events, k)
+        motion = Motion._make([column[k] for column in events.motions])
         if events.is_gap[k] or not self.setup.has_rate:
             return motion
         earth_i = self.attitude().T @ self.setup.earth_rad_s
@@ -652,9 +693,8 @@ class FilterShell(ABC):
                 self._observe_far(motion, views, new)
             new = self.observe(motion, views, new)
             if new != NO_ROW:
-                self.augment(motion, views.z[new], views.R_z[new])
-                self._place(views, int(views.ids[new]), self._landmarks)
-                self._landmarks += 1
+                slot = self.augment(motion, views.z[new], views.R_z[new])
+                self._place(views, int(views.ids[new]), slot)
                 views.outcome[new] = NEW
         # only landmarks of the map are compared with it
         if self._known.held:
@@ -678,16 +718,6 @@ class FilterShell(ABC):
             judged = self.observe_far(motion, slot, views.z[row], views.R_z[row])
             if judged is not None:
                 views.outcome[row], views.e[row], views.S[row] = judged
-
-    def _gate(self, landmark_id: int) -> float:
-        """Mahalanobis distance beyond which a sighting is refused, because it may contradict the map.
-
-        Also of a landmark that has moved: two objects may have its identity, of which only one is mapped again.
-        """
-        known = self._known
-        if landmark_id not in known.held and landmark_id not in known.moved:
-            return self.sonar.gate
-        return min(self.sonar.gate, self._known.gate)
 
     def _judge_map(self, views: Views, row: int) -> None:
         """Let a landmark of the map go that has moved; its next sighting maps it again."""

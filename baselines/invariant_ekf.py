@@ -45,6 +45,7 @@ vertical, at any estimate, so these unobservable directions stay unobservable. D
 from copy import deepcopy
 from typing import ClassVar, NamedTuple
 
+import gtsam
 import numpy as np
 from pydantic import Field
 
@@ -59,7 +60,6 @@ from baselines.events import (
     Motion,
     Sonar,
     Views,
-    elevation_of_new,
     feel,
     in_frame,
     is_followed,
@@ -68,16 +68,7 @@ from baselines.events import (
     shows_new,
 )
 from baselines.filter import FilterParams, FilterShell
-from baselines.kalman import (
-    GATED,
-    correction,
-    judged,
-    polar_covariance,
-    stands_on_floor,
-    symmetric,
-    view_noise,
-    write_judged,
-)
+from baselines.kalman import correction, correction_by_view, symmetric, view_noise
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.measurements import Floats
 from sonar_graph.models import (
@@ -90,9 +81,7 @@ from sonar_graph.models import (
     bias_jacobian,
     bias_sigmas,
     gyro_bias_of,
-    locate_from_body,
     sight_of,
-    wrap_angle,
 )
 from sonar_graph.motion import MotionSource
 from sonar_graph.numerics import (
@@ -103,7 +92,6 @@ from sonar_graph.numerics import (
     Vec6,
     compiled,
     cross,
-    cross_matrix,
     exp_and_mean,
     inlined,
     innovation_of,
@@ -257,11 +245,8 @@ def observe(
             return row
         k = 1 + views.slot[row]
         at = BODY.start + POINT * k
-        z = views.z[row]
-        R_z = views.R_z[row]
         R, X, D = pose_after(state, motion)
         sight = sight_of(R, X, mount, vec(state.points[k]))
-        e = np.array([z[0] - sight.range_m, wrap_angle(z[1] - sight.azimuth_rad)])
         H = np.zeros((2, len(state.P)))
         # a turn of everything about the origin changes no view: H_theta is zero
         store_row(sight.range_by_point, H, 0, at)
@@ -270,13 +255,10 @@ def observe(
         store_row(-1.0 * sight.azimuth_by_point, H, 1, BODY.start)
         store_by_biases(sight.range_by_body, D, H, 0)
         store_by_biases(sight.azimuth_by_body, D, H, 1)
-        noise = view_noise(sight, motion, R_z)
-        HP, S = innovation_of(state.P, H, noise)  # (9)
-        # the kernel widens the noise of the detection, not that of the motion
-        outcome, widened = judged(e, S, R_z, views.gate[row], sonar.kernel_width)
-        if outcome != GATED:
-            move(state, correction(state.P, HP, S + widened, e))
-        write_judged(views, row, outcome, e, S)
+        noise = view_noise(sight, motion, views.R_z[row])
+        width = sonar.kernel_width
+        xi = correction_by_view(state.P, H, sight, noise, views, row, width)  # (9)
+        move(state, xi)
     return NO_ROW
 
 
@@ -399,10 +381,10 @@ class InvariantEkf(FilterShell):
     def linearised(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """R', X', and ``J xi = [R'^T theta; R'^T (xi_0 - [X']x theta)] + D beta``, to which eps is added."""
         R, X, D = pose_arrays(self._state, motion)
-        J = np.zeros((6, len(self._state.P)))
+        J = np.zeros((6, BARE))
         J[:3, THETA] = R.T
         J[3:, BODY] = R.T
-        J[3:, THETA] = -R.T @ cross_matrix(X)
+        J[3:, THETA] = -R.T @ gtsam.SO3.Hat(X)
         J[:, BETA] = D
         return R, X, J
 
@@ -429,24 +411,15 @@ class InvariantEkf(FilterShell):
         """Place of c in xi, (10), and its estimate."""
         return BETA_COMPASS, self._state.bias[COMPASS]
 
-    def augment(self, motion: Motion, z: Floats, R_z: Floats) -> None:
-        """Append a landmark, (6), on a floor of known height if it is near."""
-        state = self._state
-        sonar = self.sonar
-        R, X, J = self.linearised(motion)
-        g, G_b, G_z = locate_from_body(
-            R, X, sonar.mount, z, elevation_of_new(R, X, sonar, z)
-        )
-        G = self.by_point(G_b @ J)
-        GP = G @ state.P
-        V = G_z @ polar_covariance(R_z, sonar.aperture_rad) @ G_z.T
-        own = symmetric(GP @ G.T + G_b @ motion.C @ G_b.T + V)
-        P = np.block([[state.P, GP.T], [GP, own]])
-        self._state = state._replace(points=np.vstack((state.points, g)), P=P)
-        H = self._height_jacobian(len(state.points))
-        if stands_on_floor(g[2], (H @ P @ H.T)[0, 0], sonar):
-            variance_m2 = np.array([[sonar.floor_variance_m2]])
-            self.correct(H, sonar.floor_z_m - g[2:], variance_m2)
+    def append(self, place: Floats, P: Floats) -> int:
+        """Append a landmark, (6)."""
+        points = np.vstack((self._state.points, place))
+        self._state = self._state._replace(points=points, P=P)
+        return len(points) - 2
+
+    def height_jacobian(self, slot: int) -> Floats:
+        """H of a landmark's height, (7)."""
+        return self._height_jacobian(1 + slot)
 
     def update_up(self, up: Floats, sigma_rad: float, i_R_j: Floats) -> None:
         """Update by the direction of the world's up in the body, (8)."""
@@ -492,19 +465,13 @@ class InvariantEkf(FilterShell):
         up = vec(self._state.R[2]) if self._state.is_level else ZERO
         return np.array(gyro_bias_of(self._state.bias, up))
 
-    def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
-        """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
-        R, X, J = self.linearised(motion)
-        A = J[:, :BARE]
-        return R, X, symmetric(A @ self._state.P[:BARE, :BARE] @ A.T + motion.C)
-
     def points(self, slots: list[int]) -> tuple[Floats, Floats]:
         """Positions, and covariance of their coordinates, ``xi_k - [x_k]x theta``."""
         P = self._state.P
         positions = self._state.points[[1 + slot for slot in slots]]  # (m, 3)
         first = BARE + POINT * np.array(slots, dtype=np.int64)
         places = np.add.outer(first, np.arange(POINT)).ravel()
-        B = np.array([cross_matrix(at) for at in positions]).reshape(-1, 3)  # (3 m, 3)
+        B = np.array([gtsam.SO3.Hat(at) for at in positions]).reshape(-1, 3)  # (3 m, 3)
         turned = B @ P[THETA, places]  # (3 m, 3 m)
         joint = (
             P[np.ix_(places, places)] - turned - turned.T + B @ P[THETA, THETA] @ B.T
@@ -523,7 +490,7 @@ def start_state(calibration: Calibration) -> InvariantState:
     X = np.array(start.position_m)
     A = np.zeros((BARE, 6))
     A[THETA, :3] = R
-    A[BODY, :3] = cross_matrix(X) @ R
+    A[BODY, :3] = gtsam.SO3.Hat(X) @ R
     A[BODY, 3:] = R
     P = A @ start.covariance() @ A.T
     P[BETA, BETA] = np.diag(bias_sigmas(calibration)[0] ** 2)
@@ -546,7 +513,7 @@ def with_map(state: InvariantState, known: KnownLandmarks) -> InvariantState:
     places = known.places()  # (m, 3)
     A = np.zeros((places.size, len(state.P)))  # of xi_1 to xi_m by xi
     for k, place in enumerate(places):
-        A[POINT * k : POINT * (k + 1), THETA] = cross_matrix(place)
+        A[POINT * k : POINT * (k + 1), THETA] = gtsam.SO3.Hat(place)
     AP = A @ state.P
     own = symmetric(AP @ A.T + known.joint())
     P = np.block([[state.P, AP.T], [AP, own]])

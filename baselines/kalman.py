@@ -11,8 +11,8 @@ from numpy.linalg import LinAlgError
 
 from baselines.events import Motion, Sonar, Views
 from sonar_graph.measurements import Floats
-from sonar_graph.models import FLOOR_GATE, Sight
-from sonar_graph.numerics import compilable, compiled, inlined, mat6
+from sonar_graph.models import FLOOR_GATE, Sight, wrap_angle
+from sonar_graph.numerics import compilable, compiled, inlined, innovation_of, mat6
 from sonar_graph.states import OUTCOME_NUMBERS, Outcome
 
 USED = OUTCOME_NUMBERS[Outcome.USED]
@@ -51,6 +51,15 @@ def cholesky(S: Floats) -> Floats:
 
 
 @compilable
+def solve_lower(L: Floats, w: Floats) -> None:
+    """``w <- L^-1 w``, with a lower triangle L."""
+    for r in range(len(w)):
+        for k in range(r):
+            w[r] -= L[r, k] * w[k]
+        w[r] /= L[r, r]
+
+
+@compilable
 def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
     """``K e``, shape (n,), with ``K = P H^T S^-1``; P becomes ``P - K S K^T``.
 
@@ -59,15 +68,13 @@ def correction(P: Floats, HP: Floats, S: Floats, e: Floats) -> Floats:
     # with S = L L^T and V = L^-1 H P: K e = V^T L^-1 e, K S K^T = V^T V
     L = cholesky(S)
     V = HP.copy()  # (m, n)
-    w = e.copy()  # L^-1 e
+    w = e.copy()
+    solve_lower(L, w)
     Ke = np.zeros(len(P))
     for r in range(len(S)):
         # a variance of zero or below, or no number
         if math.isnan(L[r, r]):
             raise LinAlgError("S is not positive definite")
-        for k in range(r):
-            w[r] -= L[r, k] * w[k]
-        w[r] /= L[r, r]
         for i in range(len(P)):
             # loops over numbers: numba takes long to compile sums of rows
             for k in range(r):
@@ -102,27 +109,13 @@ def view_noise(sight: Sight, motion: Motion, R_z: Floats) -> Floats:
     return R
 
 
-@compilable
-def write_judged(views: Views, row: int, outcome: int, e: Floats, S: Floats) -> None:
-    """Write outcome, innovation and its covariance of a view."""
-    views.outcome[row] = outcome
-    # numbers: for arrays numba compiles the text of an error, which takes a tenth of all
-    for i in range(2):
-        views.e[row, i] = e[i]
-        for j in range(2):
-            views.S[row, i, j] = S[i, j]
-
-
 @compiled
 def distance(e: Floats, S: Floats) -> float:
     """``sqrt(e^T S^-1 e)``, the Mahalanobis distance of an innovation; NaN where S is not positive definite."""
-    L = cholesky(S)
-    w = e.copy()  # L^-1 e
+    w = e.copy()
+    solve_lower(cholesky(S), w)
     squared = 0.0
-    for r in range(len(S)):
-        for k in range(r):
-            w[r] -= L[r, k] * w[k]
-        w[r] /= L[r, r]
+    for r in range(len(w)):
         squared += w[r] * w[r]
     return math.sqrt(squared)
 
@@ -146,6 +139,37 @@ def judged(
         for j in range(2):
             widened[i, j] = (spread[i] * spread[j] - 1.0) * R_z[i, j]
     return USED, widened
+
+
+@compilable
+def correction_by_view(
+    P: Floats,
+    H: Floats,
+    sight: Sight,
+    noise: Floats,
+    views: Views,
+    row: int,
+    kernel_width: float,
+) -> Floats:
+    """`correction` by range and azimuth of a landmark, zero beyond the gate; writes outcome, e of (7) and S of the view.
+
+    ``noise``: `view_noise`.
+    """
+    z = views.z[row]
+    turned_rad = wrap_angle(z[1] - sight.azimuth_rad)
+    e = np.array([z[0] - sight.range_m, turned_rad])  # (7)
+    HP, S = innovation_of(P, H, noise)
+    outcome, widened = judged(e, S, views.R_z[row], views.gate[row], kernel_width)
+    views.outcome[row] = outcome
+    # numbers: for arrays numba compiles the text of an error, which takes a tenth of all
+    for i in range(2):
+        views.e[row, i] = e[i]
+        for j in range(2):
+            views.S[row, i, j] = S[i, j]
+    if outcome == GATED:
+        return np.zeros(len(P))
+    # the kernel widens the noise of the detection, not that of the motion
+    return correction(P, HP, S + widened, e)
 
 
 def is_far(cov: Floats, G_z: Floats, range_m: float, R_z: Floats) -> bool:

@@ -485,7 +485,7 @@ class RefusedRow(NamedTuple):
     """``imu``, ``dvl``, ``depth``, ``heading`` or ``positions``."""
     stamp_ns: int
     reason: Refusal
-    distance: float
+    distance: float = math.nan
     """Squared Mahalanobis distance of an outlier, or of a depth out of reach; NaN for other reasons."""
 
 

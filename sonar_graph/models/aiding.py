@@ -179,12 +179,10 @@ class Contradictions:
 
     def judge(self, sensor: str, distances: Floats | float) -> None:
         """Count distances in sigmas, of one row or several."""
-        self._far[sensor] += int(
-            np.count_nonzero(np.asarray(distances) > CONTRADICTING_SIGMAS)
-        )
+        self._far[sensor] += int(np.count_nonzero(distances > CONTRADICTING_SIGMAS))
         self._judged[sensor] += np.size(distances)
         self._beyond_doubt[sensor] += int(
-            np.count_nonzero(np.asarray(distances) > DOUBTLESS_SIGMAS[sensor])
+            np.count_nonzero(distances > DOUBTLESS_SIGMAS[sensor])
         )
 
     def messages(self) -> list[str]:

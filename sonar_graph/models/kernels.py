@@ -21,7 +21,7 @@ class Kernel(Section):
 
     def loss(self, e: Floats) -> Floats:
         """The loss of errors in standard deviations."""
-        return np.asarray(0.5 * np.abs(e) ** 2)
+        return 0.5 * np.abs(e) ** 2
 
     def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
         """The loss as GTSAM has it; None for Gaussian noise."""
@@ -87,7 +87,7 @@ class RobustKernel(Kernel):
         if self.shape == "huber":
             return np.where(size <= k, 0.5 * size**2, k * (size - 0.5 * k))
         # log1p keeps the digits of small errors, where the loss is that of Gaussian noise
-        return np.asarray(0.5 * k**2 * np.log1p((size / k) ** 2))
+        return 0.5 * k**2 * np.log1p((size / k) ** 2)
 
     def estimator(self) -> gtsam.noiseModel.mEstimator.Base:
         """The loss as GTSAM has it."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from sonar_graph.calibration import KnownMap
 from sonar_graph.measurements import Floats
+from sonar_graph.numerics import diagonal_blocks
 from sonar_graph.states import LandmarkMap
 
 CONTRADICTS = 13.8
@@ -45,6 +46,9 @@ class Verdict(Enum):
 class KnownLandmarks:
     """Landmarks of the map, with the sightings that agree with it and those that contradict it."""
 
+    gate = math.sqrt(CONTRADICTS)
+    """Mahalanobis distance from which on a sighting contradicts the map."""
+
     def __init__(self, known: KnownMap | None, *, may_release: bool = True) -> None:
         self.map = known
         self._may_release = may_release
@@ -65,11 +69,6 @@ class KnownLandmarks:
         """Contradictions that are like the one before: what they show stands in one place."""
         self._elsewhere: set[int] = set()
         """Landmarks with `FEWEST` of them."""
-
-    @property
-    def gate(self) -> float:
-        """Mahalanobis distance from which on a sighting contradicts the map."""
-        return math.sqrt(CONTRADICTS)
 
     def judge(self, landmark_id: int, stamp_ns: int, e: Floats, S: Floats) -> Verdict:
         """Treatment of a sighting with an innovation of range and azimuth, shape (2,), and its covariance, (2, 2)."""
@@ -144,14 +143,9 @@ class KnownLandmarks:
         """Place (3,) and covariance (3, 3) of each landmark of a fixed map that has not moved."""
         if self.map is None or not self.map.is_fixed:
             return {}
-        P = self.map.joint()
-        places = np.array(self.map.positions_m)
-        given = {}
-        for k, landmark_id in enumerate(self.map.ids):
-            if landmark_id in self.held:
-                block = slice(3 * k, 3 * k + 3)
-                given[landmark_id] = (places[k], P[block, block])
-        return given
+        blocks = diagonal_blocks(self.map.joint(), 3)
+        rows = zip(self.ids, self.places(), blocks, strict=True)
+        return {i: (place, P) for i, place, P in rows if i in self.held}
 
     def with_given(self, found: LandmarkMap) -> LandmarkMap:
         """An estimated map, with the landmarks of a fixed map as they were given."""

@@ -26,6 +26,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.calibration import SonarCalibration
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.numerics import (
     UPPER_RIGHT,
@@ -35,7 +36,6 @@ from sonar_graph.numerics import (
     compilable,
     compiled,
     cross,
-    cross_matrix,
     inlined,
     mat,
     skew,
@@ -70,6 +70,21 @@ def polar_difference(z: Floats, expected: Floats) -> Floats:
     components = e.T  # a view with range and azimuth on the first axis; of one difference, plain numbers
     components[1] = wrap_angle(components[1])
     return e
+
+
+def polar_measurements(
+    detections: LandmarkDetections, sonar: SonarCalibration
+) -> tuple[Floats, Floats]:
+    """Range (m) and azimuth (rad), shape (m, 2), and their covariances, (m, 2, 2): the calibration's without others."""
+    z = np.column_stack((detections.range_m, detections.azimuth_rad))
+    given = detections.range_azimuth_cov
+    # a covariance off symmetry by rounding is made symmetric
+    noise = 0.5 * (given + given.transpose(0, 2, 1))
+    is_unknown = np.isnan(noise)
+    if is_unknown.any():
+        sigmas = (sonar.range_sigma_m, sonar.azimuth_sigma_rad)
+        noise[is_unknown.any(axis=(1, 2))] = np.diag(np.square(sigmas))
+    return z, noise
 
 
 class Polar(NamedTuple):
@@ -214,7 +229,7 @@ def _as_arrays(pose: gtsam.Pose3) -> tuple[Floats, Floats]:
 
 def body_point_jacobian(R: Floats, q: Floats) -> Floats:
     """``R [-[q]x  I]``, shape (3, 6): a point q of the body moves so in the world by [theta, rho] of its pose."""
-    return np.hstack((-R @ cross_matrix(q), R))
+    return np.hstack((-R @ gtsam.SO3.Hat(q), R))
 
 
 @compiled
@@ -268,18 +283,12 @@ def _point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) ->
     )
 
 
-def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
-    """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
-    return np.array(_point_at(range_m, azimuth_rad, elevation_rad))
-
-
 def locate(
     world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
 ) -> Floats:
     """The point of the world at these spherical coordinates of the sonar, shape (3,), m."""
-    return np.asarray(
-        world_T_sonar.transformFrom(sonar_point(range_m, azimuth_rad, elevation_rad))
-    )
+    in_sonar = np.array(_point_at(range_m, azimuth_rad, elevation_rad))
+    return world_T_sonar.transformFrom(in_sonar)
 
 
 def locate_jacobians(

@@ -32,7 +32,7 @@ def compiled_beside(
         Function that waits until the work is done.
     """
     if not any(needs_compiling(module) for module in modules):
-        yield _nothing_to_wait_for
+        yield lambda: None
         return
     process = get_context("spawn").Process(
         target=_do_silently, args=(work,), daemon=True
@@ -43,10 +43,6 @@ def compiled_beside(
     finally:
         process.terminate()
         process.join()
-
-
-def _nothing_to_wait_for() -> None:
-    """Return at once."""
 
 
 def _do_silently(work: Callable[[], object]) -> None:

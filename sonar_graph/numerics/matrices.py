@@ -1,7 +1,7 @@
 """Compilation of loops, and the vectors, matrices and rotations in them: ``F @ P @ F.T + G @ C @ G.T`` as in the paper.
 
 Vectors and matrices are tuples. Inside a compiled function they live in registers, where an array of nine numbers is an
-allocation that costs as much as a product; outside, the same operators are ordinary methods. The last two functions are
+allocation that costs as much as a product; outside, the same operators are ordinary methods. The last functions are
 for arrays that never enter compiled code. Rotations follow Forster et al.,
 "On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8).
 """
@@ -467,16 +467,10 @@ def chord_inverse(theta: Vec3) -> Mat3:
     return rodrigues(theta, x, -0.5, curvature(x)[0])
 
 
-def cross_matrix(v: Floats) -> Floats:
-    """[v]x with ``[v]x w = v x w``, shape (3, 3)."""
-    m = np.zeros((3, 3))
-    m[0, 1] = -v[2]
-    m[0, 2] = v[1]
-    m[1, 0] = v[2]
-    m[1, 2] = -v[0]
-    m[2, 0] = -v[1]
-    m[2, 1] = v[0]
-    return m
+def diagonal_blocks(A: Floats, size: int) -> Floats:
+    """The m blocks on the diagonal of a matrix, shape (m, size, size)."""
+    m = len(A) // size
+    return A.reshape(m, size, m, size)[np.arange(m), :, np.arange(m)]
 
 
 def running_rotations(turns: Floats) -> Floats:

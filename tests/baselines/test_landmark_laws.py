@@ -1,13 +1,13 @@
 """Laws of landmarks, for both filters: augmentation, floor, gate, innovation, and views from far away."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
-from baselines.events import read_detections
 from baselines.kalman import GATED, USED, far_covariance, is_far, judged
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.models import (
@@ -15,6 +15,7 @@ from sonar_graph.models import (
     RobustKernel,
     elevation_on_floor,
     locate,
+    polar_measurements,
 )
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.testing.numerical import central_differences
@@ -35,6 +36,7 @@ from .filters import (
     sonar_after,
     world_at,
 )
+from .runs import seen
 
 LEVEL = np.zeros(3)
 TILTED = np.array([0.1, 0.2, 0.3])
@@ -139,10 +141,12 @@ def test_noise_is_the_log_s_or_where_it_is_missing_the_calibration_s(
 ):
     logged = np.array([[[4e-4, 3e-5], [1e-5, 1e-4]]] * 2)
     logged[(1, *hole)] = math.nan
-    assert_allclose(
-        read_detections(*np.ones((2, 2)), logged, NOISE)[1],
-        [[[4e-4, 2e-5], [2e-5, 1e-4]], NOISE],
-    )
+    detections = replace(seen([0, 0], 1.0, 1.0), range_azimuth_cov=logged)
+    sonar = SonarCalibration(range_sigma_m=0.03, azimuth_sigma_rad=0.02)
+    z, noise = polar_measurements(detections, sonar)
+    assert_array_equal(z, np.ones((2, 2)))
+    own = np.diag([0.03**2, 0.02**2])
+    assert_allclose(noise, [[[4e-4, 2e-5], [2e-5, 1e-4]], own])
 
 
 # ---------------------------------------------------------------------------------------------- views from far away

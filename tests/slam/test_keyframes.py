@@ -20,7 +20,6 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.measurements import Depth, Dvl, Heading, Imu
 from sonar_graph.navigation import Odometry
-from sonar_graph.numerics import cross_matrix
 from sonar_graph.slam import KeyframeParams
 from sonar_graph.slam.keyframes import Keyframes, average_at_end
 from tests.navigation.rows import NS, T0_NS, dvl, imu, stamps
@@ -292,7 +291,7 @@ def test_fixes_have_the_covariance_of_the_motion_from_their_keyframe():
         (stamp_ns,) = at(when).tolist()
         keyframes.advance(stamp_ns)
         C = times * keyframes.motion_since_newest(stamp_ns).covariance
-        lever = np.hstack((-cross_matrix(antenna), np.eye(3)))
+        lever = np.hstack((-gtsam.SO3.Hat(antenna), np.eye(3)))
         expected.append(1e-4 * np.eye(3) + lever @ C @ lever.T)
         keyframes.add_fix(stamp_ns, np.zeros(3), 1e-4 * np.eye(3))
         keyframes.update_if_due()
