@@ -557,7 +557,7 @@ def test_a_place_is_as_uncertain_as_range_azimuth_pose_and_heights_make_it(
     floor_m = 0.08
     R_z = np.diag([0.03**2, 0.01**2])
     body = BodyInFrame(o_T_body, np.diag(sigmas**2), height_m**2)
-    S = spread(body, o_T_body.compose(body_T_sonar), ray, R_z, floor_m**2).S
+    S = spread(body, body_T_sonar, ray, R_z, floor_m**2).S
     drawn = []
     for _ in range(4000):
         pose = o_T_body.compose(gtsam.Pose3.Expmap(sigmas * rng.standard_normal(6)))

@@ -422,10 +422,8 @@ def _corrected(
     else:
         # b (D - D_0), (3, 3)
         by_bias = gyro_bias_sigma * (line.D_bias - steady.D_bias)[3:]
-        bent_m2 = (
-            2.0
-            * float(gyro_bias_sigma * line.duration_s * np.linalg.norm(by_bias, 2)) ** 2
-        )
+        bent = gyro_bias_sigma * line.duration_s * float(np.linalg.norm(by_bias, 2))
+        bent_m2 = 2.0 * bent**2
         # a line fitted to many samples may have less Doppler noise than the last sample
         variances, axes = np.linalg.eigh((line.covariance - steady.covariance)[3:, 3:])
         V = (

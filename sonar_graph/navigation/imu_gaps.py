@@ -119,23 +119,30 @@ def error_in_hole(
     last = min(row, rows) - 1
     typical_s = typical_ns(stamps, last) * 1e-9
     by_row = turns.gyro_density**2 / typical_s if typical_s > 0.0 else 0.0  # n^2 / dt
-    if row < rows:
-        T = (stamps[row] - stamps[last]) * 1e-9
-        noise = 0.5 * by_row * T
-        return Vec3(
-            closed_variance(turns.sigma[0], turns.time_s[0], T) / T + noise,
-            closed_variance(turns.sigma[1], turns.time_s[1], T) / T + noise,
-            closed_variance(turns.sigma[2], turns.time_s[2], T) / T + noise,
-        )
+    is_open = row >= rows
+    T = ((until_ns if is_open else stamps[row]) - stamps[last]) * 1e-9
     # open: what has grown since t, of a variance that counts from the last row
-    T = (until_ns - stamps[last]) * 1e-9
     before_s = (t - stamps[last]) * 1e-9
-    noise = by_row * (T + before_s)
+    noise = by_row * (T + before_s) if is_open else 0.5 * by_row * T
     return Vec3(
-        open_growth(turns.sigma[0], turns.time_s[0], before_s, T) + noise,
-        open_growth(turns.sigma[1], turns.time_s[1], before_s, T) + noise,
-        open_growth(turns.sigma[2], turns.time_s[2], before_s, T) + noise,
+        density_about(turns, 0, is_open, before_s, T) + noise,
+        density_about(turns, 1, is_open, before_s, T) + noise,
+        density_about(turns, 2, is_open, before_s, T) + noise,
     )
+
+
+@compilable
+def density_about(
+    turns: Turns, axis: int, is_open: bool, before_s: float, length_s: float
+) -> float:
+    """What turning about an axis adds: its variance over a closed hole, or its growth in an open one, over time."""
+    sigma = turns.sigma[axis]
+    time_s = turns.time_s[axis]
+    if not is_open:
+        return closed_variance(sigma, time_s, length_s) / length_s
+    before = open_variance(sigma, time_s, before_s)
+    grown = open_variance(sigma, time_s, length_s) - before
+    return grown / (length_s - before_s)
 
 
 @compilable
@@ -156,12 +163,3 @@ def open_variance(sigma: float, time_s: float, length_s: float) -> float:
         return (sigma * time_s) ** 2 * a**4 / 4.0 * (1.0 - 8.0 / 15.0 * a)
     by_end = (6.0 + a * (6.0 + 2.0 * a)) * np.exp(-a)
     return (sigma * time_s) ** 2 * (a * a - 6.0 + by_end)
-
-
-@compilable
-def open_growth(sigma: float, time_s: float, before_s: float, until_s: float) -> float:
-    """Growth of `open_variance` from one length of the hole to another, over the time between them, rad²/s."""
-    grown = open_variance(sigma, time_s, until_s) - open_variance(
-        sigma, time_s, before_s
-    )
-    return grown / (until_s - before_s)

@@ -171,7 +171,7 @@ def map_fit(sequence: Sequence) -> MapFit:
             gain = evidence(followed(sequence, looser)) - evidence(given)
         if rise_m or gain <= math.log(CLEAR):
             return MapFit(start, elsewhere=elsewhere, rise_m=rise_m)
-    sigma_m = math.sqrt(float(np.median(np.diag(known.joint()))))
+    sigma_m = math.sqrt(np.median(np.diag(known.joint())))
     for factor in () if rise_m else SIGMA_FACTORS:
         # a map of another place fits too where its sigmas are metres
         is_wide = factor > SIGMA_FACTORS[0] and factor * sigma_m > WIDEST_M
@@ -191,17 +191,21 @@ def misfits(start: FoundStart, data: MapData) -> bool:
     """Check that the landmarks that agree with a start err more than stated, by three sigmas of a mean of chi-squares."""
     seen = data.rows[np.argmax(data.is_of, axis=1)]  # (l,)
     squared = squared_distances(start, np.isin(seen, [*start.agreeing]), data)
-    return float(squared.mean()) > 2.0 + 3.0 * 2.0 / math.sqrt(len(squared))
+    return squared.mean() > 2.0 + 3.0 * 2.0 / math.sqrt(len(squared))
+
+
+def starts(sequence: Sequence, known: KnownMap) -> Iterator[tuple[FoundStart, int]]:
+    """Start at the end of each window that gives one, with the number of landmarks that were seen by then."""
+    for locator in locators(sequence, known):
+        newest = locator.newest()
+        start = located(newest, known)
+        if start is not None:
+            yield start, len({sighting.row for sighting in newest})
 
 
 def first_start(sequence: Sequence, known: KnownMap) -> FoundStart | None:
     """Start in the map; None where the sightings give none."""
-    for locator in locators(sequence, known):
-        # at the end of each window instead of each frame
-        start = located(locator.newest(), known)
-        if start is not None:
-            return start
-    return None
+    return next((start for start, _ in starts(sequence, known)), None)
 
 
 def followed(sequence: Sequence, known: KnownMap) -> MapLocator:
@@ -301,21 +305,26 @@ def windows(sequence: Sequence) -> Iterator[Measurements]:
     return sequence.replay(np.minimum(instants_ns, sequence.end_ns))
 
 
-def evidence(locator: MapLocator) -> float:
-    """Logarithm of the evidence of the best start; minus infinity without one."""
+def best_start(locator: MapLocator) -> FoundStart | None:
+    """The start with the most evidence; None without one."""
     newest = locator.newest()
     starts = candidates(map_data(newest, locator.map)) if newest else []
-    return starts[0].log_evidence if starts else -math.inf
+    return starts[0] if starts else None
+
+
+def evidence(locator: MapLocator) -> float:
+    """Logarithm of the evidence of the best start; minus infinity without one."""
+    best = best_start(locator)
+    return -math.inf if best is None else best.log_evidence
 
 
 def by_all(locator: MapLocator) -> FoundStart | None:
     """The best start by the newest sightings of each landmark; None without one."""
-    newest = locator.newest()
-    starts = candidates(map_data(newest, locator.map)) if newest else []
-    if not starts:
+    best = best_start(locator)
+    if best is None:
         return None
     of_each = newest_of_each(locator.sightings, MOST_OF_LANDMARK)
-    return refined(starts[0].parameters, map_data(of_each, locator.map))
+    return refined(best.parameters, map_data(of_each, locator.map))
 
 
 def common_rise(
@@ -358,13 +367,10 @@ def shown(locator: MapLocator) -> float:
 
 def gives_start(sequence: Sequence, known: KnownMap) -> bool:
     """Check that sightings give a start, by enough landmarks and more than half of those that were seen by then."""
-    for locator in locators(sequence, known):
-        newest = locator.newest()
-        start = located(newest, known)
-        most = max(FEWEST, 1 + len({sighting.row for sighting in newest}) // 2)
-        if start is not None and len(start.agreeing) >= most:
-            return True
-    return False
+    return any(
+        len(start.agreeing) >= max(FEWEST, 1 + seen // 2)
+        for start, seen in starts(sequence, known)
+    )
 
 
 def undone(known: KnownMap, T: np.ndarray) -> KnownMap:

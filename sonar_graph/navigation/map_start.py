@@ -32,7 +32,6 @@ Inference, and Learning Algorithms", 2003, chapter 28 (evidence).
 """
 
 import math
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
@@ -62,9 +61,12 @@ from sonar_graph.models import (
     identify,
     listed,
     locate,
+    locate_jacobians,
+    polar_measurements,
 )
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.numerics import chi_square_quantile
+from sonar_graph.navigation.samples import StampedRows
+from sonar_graph.numerics import chi_square_quantile, diagonal_blocks
 from sonar_graph.states import (
     FIRST_ANONYMOUS_ID,
     DetectionLog,
@@ -163,14 +165,6 @@ class BodyInFrame(NamedTuple):
     """Change of the perturbation with an error of odometry, a twist in o, shape (6, 6)."""
 
 
-class DepthRow(NamedTuple):
-    """Height of the pressure port."""
-
-    stamp_ns: int
-    z_m: float
-    variance_m2: float
-
-
 class MapLocator:
     """Finds the start in a map, frame by frame; results depend on stamps alone."""
 
@@ -198,12 +192,11 @@ class MapLocator:
         """Number of sightings when they were weighed last."""
         self._others: set[int] = set()
         """Identities that were seen and are not in the map."""
-        sonar = calibration.sonar
-        self._body_T_sonar = sonar.mounting.pose()
-        self._R_z = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
+        self._body_T_sonar = calibration.sonar.mounting.pose()
         self._heights_m2 = np.diag(self.map.joint())[2::3].tolist()
         """Variances of the landmarks' heights."""
-        self._depths: list[DepthRow] = []
+        self._depths = StampedRows(np.empty(0), np.empty(0))
+        """Heights of the pressure port, m, and their variances, m²; NaN where the calibration's holds."""
 
     def add(self, measurements: Measurements) -> None:
         """Take in measurements, and look for the start, or for a better one, after each frame."""
@@ -264,17 +257,9 @@ class MapLocator:
     def frames_seen(self, measurements: Measurements) -> Iterator[int]:
         """Take in measurements; yields the stamp of each frame that shows landmarks of the map, once it is taken in."""
         self._odometry.add(measurements.imu, measurements.dvl)
-        if (depth := measurements.depth) is not None:
-            sigma_m = self._calibration.depth.sigma_m
-            unknown = np.isnan(depth.variance_m2)
-            variance_m2 = np.where(unknown, sigma_m**2, depth.variance_m2)
-            rows = zip(depth.stamps_ns, depth.z_m, variance_m2, strict=True)
-            last_ns = self._depths[-1].stamp_ns if self._depths else 0
-            self._depths += [
-                DepthRow(int(stamp_ns), float(z_m), float(variance))
-                for stamp_ns, z_m, variance in rows
-                if stamp_ns > last_ns
-            ]
+        if measurements.depth is not None:
+            depth = measurements.depth
+            self._depths.insert(depth.stamps_ns, depth.z_m, depth.variance_m2)
         if measurements.detections is None:
             return
         for frame in measurements.detections.frames():
@@ -344,22 +329,18 @@ class MapLocator:
         C_odometry = o_Ad_body @ motion.covariance @ o_Ad_body.T
         body = self._at_depth(BodyInFrame(o_T_body, C, 0.0, by_odometry), stamp_ns)
         o_T_sonar = body.o_T_body.compose(self._body_T_sonar)
+        z, R_z = polar_measurements(frame, self._calibration.sonar)
         for k in rows:
             row = self._rows[int(ids[k])]
-            z = np.array([frame.range_m[k], frame.azimuth_rad[k]])
+            range_m, azimuth_rad = z[k].tolist()
+            floor_z_m = self._places[row, 2]
             elevation_rad = elevation_on_floor(
-                o_T_sonar,
-                float(z[0]),
-                float(z[1]),
-                float(self._places[row, 2]),
-                aperture_rad=2.0 * math.pi,
+                o_T_sonar, range_m, azimuth_rad, floor_z_m, aperture_rad=2.0 * math.pi
             )
-            sight = Ray(float(z[0]), float(z[1]), elevation_rad or 0.0)
+            sight = Ray(range_m, azimuth_rad, elevation_rad or 0.0)
             point = locate(o_T_sonar, *sight)
-            R_z = frame.range_azimuth_cov[k]
-            R_z = self._R_z if np.isnan(R_z).any() else R_z
             of_floor_m2 = self._heights_m2[row] if elevation_rad is not None else 0.0
-            found = spread(body, o_T_sonar, sight, R_z, of_floor_m2)
+            found = spread(body, self._body_T_sonar, sight, R_z[k], of_floor_m2)
             # a sonar shows what is near and strong beyond its aperture too, and there elevation changes the place most
             rise_m = self._rise_m(row, o_T_sonar, sight, found.height_m2)
             by_error = found.by_body @ body.by_odometry
@@ -377,40 +358,38 @@ class MapLocator:
     ) -> float:
         """`MapSighting.rise_m` of a landmark; ``height_m2``: variance of the height at which the sonar has it."""
         half_rad = 0.5 * self._calibration.sonar.elevation_aperture_rad
+        forward, left, upright = sight.range_m * o_T_sonar.rotation().matrix()[2]
+        in_fan = [math.cos(sight.azimuth_rad), math.sin(sight.azimuth_rad)]
+        level = in_fan[0] * forward + in_fan[1] * left
         # along the arc of elevations the height is a sine: highest and lowest at its ends, or at the top between them
-        level, upright = (
-            locate(o_T_sonar, sight.range_m, sight.azimuth_rad, elevation_rad)[2]
-            - o_T_sonar.z()
-            for elevation_rad in (0.0, 0.5 * math.pi)
-        )
         top_rad = math.atan2(upright, level)
-        tops = [top_rad, top_rad - math.pi, top_rad + math.pi]
-        heights_m = [
-            float(locate(o_T_sonar, sight.range_m, sight.azimuth_rad, elevation_rad)[2])
-            for elevation_rad in (-half_rad, half_rad, *tops)
-            if abs(elevation_rad) <= half_rad
-        ]
-        given_m = float(self._places[row, 2])
+        arc_rad = [-half_rad, half_rad, top_rad, top_rad - math.pi, top_rad + math.pi]
+        e = np.clip(arc_rad, -half_rad, half_rad)
+        heights_m = o_T_sonar.z() + level * np.cos(e) + upright * np.sin(e)
+        middle_m = (heights_m.min() + heights_m.max()) / 2
+        beyond_m = middle_m - self._places[row, 2]
         margin_m = HEIGHT_SIGMAS * math.sqrt(self._heights_m2[row] + height_m2)
-        if min(heights_m) - margin_m <= given_m <= max(heights_m) + margin_m:
-            return 0.0
-        return 0.5 * (min(heights_m) + max(heights_m)) - given_m
+        is_shown = abs(beyond_m) <= np.ptp(heights_m) / 2 + margin_m
+        return 0.0 if is_shown else beyond_m
 
     def _at_depth(self, body: BodyInFrame, stamp_ns: int) -> BodyInFrame:
         """The body at the height of the last depth, where that is better known than by odometry."""
         start_m2 = self._calibration.start.position_sigma_m[2] ** 2
         R = body.o_T_body.rotation().matrix()
-        carried_m2 = start_m2 + float(R[2] @ body.C[3:, 3:] @ R[2])
-        last = bisect_right(self._depths, stamp_ns, key=lambda depth: depth.stamp_ns)
-        if not last:
+        carried_m2 = start_m2 + (R[2] @ body.C[3:, 3:] @ R[2])
+        last = int(self._depths.stamps_ns.searchsorted(stamp_ns, side="right")) - 1
+        if last < 0:
             return body._replace(height_m2=start_m2)
-        depth = self._depths[last - 1]
-        since_s = (stamp_ns - depth.stamp_ns) * 1e-9
-        depth_m2 = depth.variance_m2 + (VERTICAL_M_S * since_s) ** 2
+        heights_m, variances_m2 = self._depths.values
+        depth_m2 = variances_m2[last]
+        if math.isnan(depth_m2):
+            depth_m2 = self._calibration.depth.sigma_m**2
+        since_s = float(stamp_ns - self._depths.stamps_ns[last]) * 1e-9
+        depth_m2 += (VERTICAL_M_S * since_s) ** 2
         if depth_m2 > carried_m2:
             return body._replace(height_m2=start_m2)
         x, y, _ = body.o_T_body.translation()
-        z = depth.z_m - R[2] @ self._calibration.depth.port_m
+        z = heights_m[last] - R[2] @ self._calibration.depth.port_m
         o_T_body = gtsam.Pose3(body.o_T_body.rotation(), np.array([x, y, z]))
         # without the error of odometry along the vertical
         level = np.eye(6)
@@ -503,44 +482,30 @@ class Spread(NamedTuple):
 
 
 def spread(
-    body: BodyInFrame, o_T_sonar: gtsam.Pose3, sight: Ray, R_z: Floats, floor_m2: float
+    body: BodyInFrame,
+    body_T_sonar: gtsam.Pose3,
+    sight: Ray,
+    R_z: Floats,
+    floor_m2: float,
 ) -> Spread:
     """Uncertainty of the place of a landmark that is seen at the elevation of its height in the map.
 
     ``R_z``: of range and azimuth; ``floor_m2``: variance of its height in the map. Where the body errs in height by h, or
     turns the landmark up by h, the elevation changes until the height is that of the map again.
     """
-    point = locate(o_T_sonar, *sight)
-    along = (point - o_T_sonar.translation()) / sight.range_m
-    sonar_R = o_T_sonar.rotation().matrix()
-    # azimuth turns the sight about the sonar's third axis
-    across = np.cross(sonar_R[:, 2], along)
-    by_z = np.column_stack([along, sight.range_m * across])  # (3, 2)
-    R = body.o_T_body.rotation().matrix()
-    by_turn = -R @ cross_matrix(body.o_T_body.transformTo(point))
-    by_body = np.hstack([by_turn, R])  # (3, 6)
+    # (3, 6), (3, 3)
+    _, by_body, by_polar = locate_jacobians(body.o_T_body, body_T_sonar, *sight)
+    by_z = by_polar[:, :2]
     cov = by_z @ R_z @ by_z.T  # (3, 3)
-    height_m2 = float((cov + by_body @ body.C @ by_body.T)[2, 2]) + body.height_m2
+    height_m2 = (cov + by_body @ body.C @ by_body.T)[2, 2] + body.height_m2
     cov[2, 2] += MOST_OF_LANDMARK * (body.height_m2 + floor_m2)
-    sin_e = math.sin(sight.elevation_rad)
-    in_fan = [math.cos(sight.azimuth_rad), math.sin(sight.azimuth_rad)]
-    up_fan = sonar_R @ [
-        -sin_e * in_fan[0],
-        -sin_e * in_fan[1],
-        math.cos(sight.elevation_rad),
-    ]
+    up_fan = by_polar[:, 2] / sight.range_m
     rise = math.copysign(max(abs(up_fan[2]), LEAST_RISE), up_fan[2])
     by_height = up_fan[:2] / rise  # of the level place
     T = np.column_stack([np.eye(2), -by_height])  # (2, 3)
     level_by_body = T @ by_body
     S = T @ cov @ T.T + level_by_body @ body.C @ level_by_body.T
-    return Spread(np.asarray(S), np.asarray(level_by_body), height_m2)
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """``[v]x`` with ``[v]x w = v x w``, shape (3, 3)."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return Spread(S, level_by_body, height_m2)
 
 
 def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
@@ -553,13 +518,13 @@ def located(sightings: list[MapSighting], known: KnownMap) -> FoundStart | None:
     log_near = math.log(data.near_m2)
     # the first of them lies anywhere in the map, the others near it
     first = log_near - math.log(data.area_m2)
-    all_wrong = float(np.sum(weights.wrong - log_near))
+    all_wrong = np.sum(weights.wrong - log_near)
     by_one = all_wrong + weights.right - weights.wrong
-    one = float(np.logaddexp.reduce(by_one)) + first  # (3)
-    of_other_place = float(np.sum(weights.elsewhere - log_near)) + first  # (3)
+    one = np.logaddexp.reduce(by_one) + first  # (3)
+    of_other_place = np.sum(weights.elsewhere - log_near) + first  # (3)
     best = starts[0]
     rivals = [start.log_evidence for start in starts[1:]] + [of_other_place, one]
-    weight = float(np.logaddexp.reduce(rivals))
+    weight = np.logaddexp.reduce(rivals)
     is_ahead = best.log_evidence - weight >= math.log(ODDS)
     return best if is_ahead and is_linear(best, data) else None
 
@@ -573,8 +538,8 @@ def map_data(sightings: list[MapSighting], known: KnownMap) -> "MapData":
     q = np.array([s.q for s in sightings])
     S = np.array([s.S for s in sightings])
     rows = np.array([s.row for s in sightings])
-    reach_m = float(np.linalg.norm(q, axis=1).max())
-    area_m2 = float(np.prod(np.ptp(places, axis=0) + 2.0 * reach_m))
+    reach_m = np.linalg.norm(q, axis=1).max()
+    area_m2 = np.prod(np.ptp(places, axis=0) + 2.0 * reach_m)
     near_m2 = min((2.0 * reach_m) ** 2, area_m2)
     is_of = np.unique(rows)[:, None] == rows
     weights = IdentityWeights.of(is_of.sum(axis=1))
@@ -600,10 +565,10 @@ def sightings_covariance(sightings: list[MapSighting]) -> Floats:
     Q = shared + shared.transpose(2, 3, 0, 1) + np.einsum("kia,lja->kilj", B, B)
     Q[np.arange(k), :, np.arange(k)] = S
     Q = Q.reshape(2 * k, 2 * k)
-    lacking_m2 = max(float(-np.linalg.eigvalsh(Q)[0]), 0.0)
+    lacking_m2 = max(-np.linalg.eigvalsh(Q)[0], 0.0)
     if lacking_m2:
-        lacking_m2 += float(np.linalg.eigvalsh(S).min())
-    return np.asarray(Q + lacking_m2 * np.eye(2 * k))
+        lacking_m2 += np.linalg.eigvalsh(S).min()
+    return Q + lacking_m2 * np.eye(2 * k)
 
 
 def shared_errors(C: Floats) -> Floats:
@@ -688,8 +653,7 @@ class MapData(NamedTuple):
     @property
     def place_cov(self) -> Floats:
         """Covariance of each place, shape (m, 2, 2)."""
-        m = len(self.places)
-        return self.M.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
+        return diagonal_blocks(self.M, 2)
 
 
 def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
@@ -702,21 +666,24 @@ def proposals(data: MapData) -> list[tuple[Floats, frozenset[int]]]:
             continue
         seen = data.q[j] - data.q[k]
         placed = data.places[b] - data.places[a]
-        both = data.Q.reshape(len(data.q), 2, -1, 2)[[k, j]][:, :, [k, j]]
-        shared = both[0, :, 1]
-        of_seen = both[0, :, 0] + both[1, :, 1] - shared - shared.T
         # a map that errs as a whole keeps the distances of its landmarks
-        common = data.M[2 * a : 2 * a + 2, 2 * b : 2 * b + 2]
-        cov = of_seen + data.place_cov[a] + data.place_cov[b] - common - common.T
-        far_m = float(np.linalg.norm(placed))
-        sigma_m = math.sqrt(float(np.trace(cov)))
-        if abs(float(np.linalg.norm(seen)) - far_m) > 4.0 * sigma_m or far_m < sigma_m:
+        cov = of_difference(data.Q, k, j) + of_difference(data.M, a, b)
+        far_m = np.linalg.norm(placed)
+        sigma_m = math.sqrt(np.trace(cov))
+        if abs(np.linalg.norm(seen) - far_m) > 4.0 * sigma_m or far_m < sigma_m:
             continue
         psi = math.atan2(placed[1], placed[0]) - math.atan2(seen[1], seen[0])
         middle = 0.5 * (data.q[k] + data.q[j])
         t = 0.5 * (data.places[a] + data.places[b]) - turn(psi) @ middle
         found.append((np.array([psi, *t]), frozenset({int(a), int(b)})))
     return found
+
+
+def of_difference(joint: Floats, i: int, j: int) -> Floats:
+    """Covariance of the difference of two places, shape (2, 2), from that of all, shape (2 n, 2 n)."""
+    blocks = joint.reshape(len(joint) // 2, 2, -1, 2)
+    shared = blocks[i, :, j]
+    return blocks[i, :, i] + blocks[j, :, j] - shared - shared.T
 
 
 def turn(psi: float) -> Floats:
@@ -748,8 +715,8 @@ def refined(
             break
         left_out[fitted[worst]] = True
         parameters = fit.parameters
-    wrong = float(np.sum(data.weights.wrong[~fit.agreeing] - math.log(data.near_m2)))
-    right = fit.log_density + float(np.sum(data.weights.right[fit.agreeing]))
+    wrong = np.sum(data.weights.wrong[~fit.agreeing] - math.log(data.near_m2))
+    right = fit.log_density + np.sum(data.weights.right[fit.agreeing])
     log_det = math.log(np.linalg.det(fit.covariance))
     volume = 1.5 * math.log(2.0 * math.pi) + 0.5 * log_det
     prior = math.log(2.0 * math.pi * data.area_m2)
@@ -798,7 +765,7 @@ def least_squares(
         coordinates = np.add.outer(2 * seen[agreeing], np.arange(2)).ravel()
         M = data.M[np.ix_(coordinates, coordinates)]  # (2 a, 2 a)
         W = all_R @ Q @ all_R.T + M
-        W_inv = np.linalg.inv(W)
+        W_inv = np.asarray(np.linalg.inv(W), np.float64)
         by_psi = q @ turn(parameters[0] + 0.5 * math.pi).T
         by_t = np.tile(np.eye(2), (a, 1))
         J = np.column_stack([by_psi.ravel(), by_t])  # (2 a, 3)
@@ -807,13 +774,13 @@ def least_squares(
         covariance = np.asarray(np.linalg.inv(J.T @ weighted), np.float64)
         step = covariance @ gradient
         parameters = parameters + step
-        if float(step @ gradient) < CONVERGED:
+        if step @ gradient < CONVERGED:
             break
     _, log_det = np.linalg.slogdet(2.0 * math.pi * W)
     log_density = -0.5 * float(e @ W_inv @ e + log_det)
     # what is left of W^-1 beside the start predicts each landmark by the others
     P = W_inv - weighted @ covariance @ weighted.T
-    own = P.reshape(a, 2, a, 2)[np.arange(a), :, np.arange(a)]  # (a, 2, 2)
+    own = diagonal_blocks(P, 2)
     residual = (P @ e).reshape(a, 2, 1)
     squared = np.zeros(a)
     if a > 2:
@@ -882,7 +849,7 @@ def mean_sightings(is_averaged: Any, data: MapData) -> tuple[Floats, Floats]:
     S = np.linalg.inv(information)
     weights = np.einsum("ak,aij,kjl->aikl", is_averaged, S, data.S_inv)  # (a, 2, k, 2)
     A = weights.reshape(2 * len(S), -1)
-    return (A @ data.q.ravel()).reshape(-1, 2), np.asarray(A @ data.Q @ A.T)
+    return (A @ data.q.ravel()).reshape(-1, 2), A @ data.Q @ A.T
 
 
 def is_linear(start: FoundStart, data: MapData) -> bool:
@@ -890,23 +857,26 @@ def is_linear(start: FoundStart, data: MapData) -> bool:
     squared_rad2 = LINEAR_SIGMAS**2 * start.covariance[0, 0]
     second_order_m = 0.5 * squared_rad2 * np.linalg.norm(data.q, axis=1)
     sigma_m = np.sqrt(0.5 * np.trace(data.S, axis1=1, axis2=2))
-    return float(second_order_m.mean()) <= float(sigma_m.mean())
+    return second_order_m.mean() <= sigma_m.mean()
 
 
 def is_near(start: FoundStart, other: FoundStart) -> bool:
     """Check that two starts differ by no more than both are uncertain, within 99.9 %."""
-    d = start.parameters - other.parameters
-    d[0] = math.remainder(d[0], 2.0 * math.pi)
     P = start.covariance + other.covariance
-    return float(d @ np.linalg.solve(P, d)) <= NEAR
+    return squared_distance(start.parameters, other.parameters, P) <= NEAR
 
 
 def is_same(parameters: Floats, better: FoundStart) -> bool:
     """Check that (psi, t_x, t_y) is a better start, within `SAME` sigmas of it."""
-    d = parameters - better.parameters
-    d[0] = math.remainder(d[0], 2.0 * math.pi)
-    squared = float(d @ np.linalg.solve(better.covariance, d))
+    squared = squared_distance(parameters, better.parameters, better.covariance)
     return squared <= SAME**2
+
+
+def squared_distance(parameters: Floats, other: Floats, P: Floats) -> float:
+    """Squared Mahalanobis distance of (psi, t_x, t_y) from another."""
+    d = parameters - other
+    d[0] = math.remainder(d[0], 2.0 * math.pi)
+    return float(d @ np.linalg.solve(P, d))
 
 
 class StartInMap:
@@ -964,9 +934,7 @@ class StartInMap:
     def landmarks(self) -> LandmarkMap:
         """Best present estimate of every landmark; none before the vehicle is located."""
         if self._inner is None:
-            return LandmarkMap(
-                np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))
-            )
+            return LandmarkMap.empty()
         return self._inner.landmarks()
 
     def newest_landmarks(self) -> LandmarkMap:
@@ -985,13 +953,7 @@ class StartInMap:
     def detections(self) -> DetectionLog:
         """Outcome of every detection since the first measurements."""
         if self._inner is None:
-            return DetectionLog(
-                np.empty(0, np.int64),
-                np.empty(0, np.int64),
-                np.empty((0, 2)),
-                np.empty((0, 2, 2)),
-                [],
-            )
+            return DetectionLog.empty()
         return self._inner.detections()
 
     def refused_rows(self) -> list[RefusedRow]:

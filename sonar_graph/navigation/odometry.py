@@ -302,7 +302,7 @@ class Odometry:
         walked_m2 = walked_until_end(
             self._sensors, gap_s, from_start_s
         ) - walked_until_end(self._sensors, gap_s, from_end_s)
-        return np.asarray(walked_m2.sum(axis=1))
+        return walked_m2.sum(axis=1)
 
     def velocity_at_imu(self, epoch_ns: int) -> tuple[Floats, float]:
         """Velocity of the IMU's point at an epoch, body axes, shape (3,), m/s, and the variance of one component."""

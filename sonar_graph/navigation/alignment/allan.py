@@ -53,7 +53,7 @@ def allan_deviation(samples: Floats, together: int) -> Floats:
     # means over every window, each a sample later than the one before
     means = (sums[together:] - sums[:-together]) / together
     steps = means[together:] - means[:-together]
-    return np.asarray(np.sqrt(0.5 * np.mean(steps**2, axis=0)))
+    return np.sqrt(0.5 * np.mean(steps**2, axis=0))
 
 
 def degrees_of_freedom(count: int, together: int) -> float:
@@ -136,4 +136,4 @@ def _steady(
     quiet = np.quantile(spread, QUIET_SHARE, axis=0)
     steps = np.abs(np.diff(means, axis=0, prepend=means[:1]))
     near = steps <= least + 5.0 * quiet * np.sqrt(2.0 / np.median(count))
-    return np.asarray((near & (spread <= LARGEST_SPREAD * quiet + least)).all(axis=1))
+    return (near & (spread <= LARGEST_SPREAD * quiet + least)).all(axis=1)

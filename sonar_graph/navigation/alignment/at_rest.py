@@ -188,7 +188,7 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
     )
     # the level part of the Earth's rate counts as noise, half of its square along each axis
     covariance[2:, 2:] += noise * np.eye(3) + 0.5 * level**2 * across
-    return np.asarray(covariance)
+    return covariance
 
 
 def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
@@ -221,12 +221,12 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
                 f"Imu.{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
                 "the vehicle moved (give another stretch, or align in motion), or the density is too small"
             )
-    rate = float(np.linalg.norm(imu.angular_velocity.mean(axis=0)))
+    rate = np.linalg.norm(imu.angular_velocity.mean(axis=0))
     if rate > LARGEST_RATE_RAD_S:
         raise AlignmentError(
             f"Imu.angular_velocity: turns at {rate:.3f} rad/s on average; no rest, give another stretch"
         )
-    force = float(np.linalg.norm(imu.specific_force.mean(axis=0)))
+    force = np.linalg.norm(imu.specific_force.mean(axis=0))
     gravity = calibration.gravity_m_s2
     if abs(force / gravity - 1.0) > LARGEST_GRAVITY_ERROR:
         raise AlignmentError(
@@ -237,8 +237,8 @@ def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
         return
     during = dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
     if during is not None:
-        speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
-        sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(
+        speed = np.linalg.norm(during.velocity.mean(axis=0))
+        sigma = np.linalg.norm(calibration.dvl.velocity_sigma_m_s) / np.sqrt(
             len(during)
         )
         if speed > LARGEST_SPEED_M_S + 5.0 * sigma:

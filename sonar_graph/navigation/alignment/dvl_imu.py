@@ -91,25 +91,25 @@ class InertialPath:
         first_after = np.searchsorted(self.seconds, latest)
         before = np.maximum(last_before, 0)
         after = np.minimum(first_after, len(self.seconds) - 1)
-        return np.asarray(inside & (self.parts[before] == self.parts[after]))
+        return inside & (self.parts[before] == self.parts[after])
 
     def parts_at(self, seconds: Floats) -> Ints:
         """Number of holes that have ended before each instant, shape (k,)."""
         last_before = np.searchsorted(self.seconds, seconds, side="right") - 1
-        return np.asarray(self.parts[np.maximum(last_before, 0)])
+        return self.parts[np.maximum(last_before, 0)]
 
     def rotations_at(self, seconds: Floats) -> Floats:
         """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
         row, share = self._between(seconds)
         since = Rotation.from_rotvec(share[:, None] * self.turns[row]).as_matrix()
-        return np.asarray(self.rotations[row] @ since)
+        return self.rotations[row] @ since
 
     def linear_at(self, seconds: Floats, values: Floats) -> Floats:
         """One of the integrals, or any values at the samples, linear in between, shape (k, ...)."""
         row, share = self._between(seconds)
         before = values[row]
         share = share.reshape(-1, *[1] * (values.ndim - 1))
-        return np.asarray(before + share * (values[row + 1] - before))
+        return before + share * (values[row + 1] - before)
 
     def _between(self, seconds: Floats) -> tuple[Ints, Floats]:
         """Last sample before each instant, and the share of the way to the next one, shape (k,) both."""
@@ -288,7 +288,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
         values: Floats, sigmas: Floats, limits: ArrayLike, reason: str
     ) -> Estimates3D:
         x, y, z = (
-            Estimate1D(float(value), float(sigma)).limited(float(limit), reason)
+            Estimate1D(float(value), float(sigma)).limited(limit, reason)
             for value, sigma, limit in zip(
                 values, sigmas, np.broadcast_to(limits, 3), strict=True
             )
@@ -312,7 +312,7 @@ def stretches_of(seconds: Floats, parts: Ints) -> Iterator[slice]:
     intervals = np.diff(seconds)
     if not len(intervals):
         return
-    usual = float(np.median(intervals))
+    usual = np.median(intervals)
     is_end = (intervals > LARGEST_INTERVAL * usual) | (np.diff(parts) > 0)
     ends = np.flatnonzero(is_end) + 1
     rows = max(LEAST_ROWS, round(STRETCH_S / max(usual, 1e-9)))
@@ -344,7 +344,7 @@ class Averaged(NamedTuple):
         """The run; None where it is too short for a difference of means."""
         since = stamped_s[rows] - stamped_s[rows].mean()
         # by the stamps as they are: moved stamps are rounded, and 2.5 rows a second would become 2 or 3
-        interval_s = float(np.median(np.diff(stamped_s[rows])))
+        interval_s = np.median(np.diff(stamped_s[rows]))
         together = max(1, round(MEAN_OVER_S / interval_s))
         t = means_over(since, together)
         if len(t) < 2:
@@ -417,7 +417,7 @@ def means_over(values: Floats, together: int) -> Floats:
     """Means of so many successive values, without an incomplete last mean, shape (n // together, ...)."""
     whole = len(values) // together
     parts = values[: whole * together].reshape(whole, together, *values.shape[1:])
-    return np.asarray(parts.mean(axis=1))
+    return parts.mean(axis=1)
 
 
 def cross_matrices(vectors: Floats) -> Floats:

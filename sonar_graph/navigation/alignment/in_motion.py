@@ -98,8 +98,8 @@ class DopplerOnPath:
         at_imu = velocity + np.cross(path.linear_at(seconds, path.rate), lever)
         turned = np.einsum("kij,kj->ki", C, at_imu)
         skewed = C @ cross_matrices(lever[None])
-        rate_variance = known.imu.gyro_noise_density**2 / float(
-            np.median(np.diff(path.seconds))
+        rate_variance = known.imu.gyro_noise_density**2 / np.median(
+            np.diff(path.seconds)
         )
         R = C @ R @ C.transpose(0, 2, 1)
         R += rate_variance * skewed @ skewed.transpose(0, 2, 1)
@@ -285,12 +285,12 @@ def gauss_newton_step(
     tilted = np.abs(step[TILT]).max()
     turned_rad = np.abs(step[GYRO]).max() * doppler.seconds[-1]
     chi_square = np.sum((b - A @ scaled) ** 2)
-    return new, covariance, float(tilted + turned_rad), float(chi_square)
+    return new, covariance, tilted + turned_rad, chi_square
 
 
 def _across(up: Floats) -> Floats:
     """Two unit vectors across another, shape (3, 2)."""
-    return np.asarray(np.linalg.svd(up[None])[2][1:].T)
+    return np.linalg.svd(up[None])[2][1:].T
 
 
 def noise_covariance(
@@ -313,4 +313,4 @@ def noise_covariance(
     # R_k [j = k] in its blocks
     own = np.zeros((k, 3, k, 3))
     own[np.arange(k), :, np.arange(k), :] = doppler.R
-    return np.asarray(by_turn @ by_turn.T + force + own.reshape(force.shape))
+    return by_turn @ by_turn.T + force + own.reshape(force.shape)

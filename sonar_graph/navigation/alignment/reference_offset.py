@@ -72,7 +72,7 @@ def match_reference_to_imu(
     seconds = path.since_origin(reference.stamps_ns)
     rows = np.flatnonzero(path.covers(seconds, RANGE_S))
     if len(rows) > 1:
-        interval_s = max(float(np.median(np.diff(seconds[rows]))), 1e-9)
+        interval_s = max(np.median(np.diff(seconds[rows])), 1e-9)
         rows = rows[:: max(1, int(np.ceil(LEAST_INTERVAL_S / interval_s - 1e-6)))]
     if sum(map(len, _stretches_of(path.parts_at(seconds[rows])))) < LEAST_ROWS - 1:
         short = Estimate1D.unknown(
@@ -135,7 +135,7 @@ def start_heading(
     """
     seconds = path.since_origin(reference.stamps_ns) + offset_s
     inside = path.covers(seconds)
-    run_s = float(np.ptp(seconds[inside]))
+    run_s = np.ptp(seconds[inside])
     inside &= path.parts_at(seconds) == path.parts_at(seconds[inside][:1])
     if np.ptp(seconds[inside]) < LEAST_PART_SHARE * run_s:
         return Estimate1D.unknown("a hole of the IMU comes too soon after the start")
@@ -153,9 +153,9 @@ def start_heading(
     third = max(1, len(rest_t) // 3)
     rise = np.median(rest[-third:]) - np.median(rest[:third])
     run = rest_t[-third:].mean() - rest_t[:third].mean()
-    slope = float(rise / run)
+    slope = rise / run
     left = rest - slope * rest_t
-    level = float(np.median(left))
+    level = np.median(left)
     # standard deviation of a normal distribution with this median of absolute deviations
     spread = 1.4826 * float(np.median(np.abs(left - level)))
     stands_out = float(np.median(heading[beginning] - level - slope * t[beginning]))

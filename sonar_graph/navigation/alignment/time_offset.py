@@ -81,13 +81,11 @@ def fit(
     """
     groups = grouped(stretches)
     if ratios is None:
-        rate = 1.0 / float(np.concatenate([s.duration_s for s in stretches]).mean())
+        rate = 1.0 / np.concatenate([s.duration_s for s in stretches]).mean()
         units = np.array([rate, rate**3])
 
         def bounded(logs: Floats) -> Floats:
-            return np.asarray(
-                units * np.exp(np.clip(logs, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT))
-            )
+            return units * np.exp(np.clip(logs, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT))
 
         def criterion(logs: Floats) -> float:
             return NormalEquations.of(groups, bounded(logs)).criterion(prior_sigmas)
@@ -134,7 +132,7 @@ def rate_noise_power(stretches: Sequence[SampleSeries], ratios: Floats) -> float
         basis = own.reshape(count, 3, m, -1)
         projected = np.swapaxes(basis, 2, 3) @ of_samples
         power += 3.0 * m * count - rank
-        power -= float(np.sum(of_samples**2) - np.sum(projected**2))
+        power -= np.sum(of_samples**2) - np.sum(projected**2)
     return power
 
 
@@ -188,7 +186,7 @@ def _whitened(group: Group, columns: Floats, ratios: Floats) -> tuple[Floats, fl
         solved = np.linalg.solve(factor, of_axes).reshape(count, m, len(axes), -1)
         white[:, axes] = np.swapaxes(solved, 1, 2)
         roots = np.log(np.diagonal(factor, axis1=1, axis2=2))
-        log_determinant += 2.0 * len(axes) * float(roots.sum())
+        log_determinant += 2.0 * len(axes) * roots.sum()
     return white, log_determinant
 
 
@@ -225,7 +223,7 @@ class NormalEquations:
         return cls(
             squares[1:, 1:],
             squares[1:, 0],
-            float(squares[0, 0]),
+            squares[0, 0],
             freedom,
             log_determinants,
         )
@@ -239,9 +237,8 @@ class NormalEquations:
             parameters = np.asarray(
                 np.linalg.solve(information, self.Aty), dtype=np.float64
             )
-            rss = max(
-                self.yty - float(parameters @ self.Aty), 1e-12 * self.yty + 1e-300
-            )
+            explained = float(parameters @ self.Aty)
+            rss = max(self.yty - explained, 1e-12 * self.yty + 1e-300)
             variance = max(rss / max(self.freedom - count, 1), LEAST_VARIANCE)
         return parameters, information, rss, variance
 
@@ -250,7 +247,7 @@ class NormalEquations:
         _, information, rss, _ = self.solve(prior_sigmas)
         freedom = max(self.freedom - len(prior_sigmas), 1)
         _, log_information = np.linalg.slogdet(information)
-        return float(freedom * np.log(rss) + self.log_determinants + log_information)
+        return freedom * np.log(rss) + self.log_determinants + log_information
 
 
 def _orthonormal(B: Floats) -> tuple[Floats, float, int]:
@@ -260,7 +257,7 @@ def _orthonormal(B: Floats) -> tuple[Floats, float, int]:
         return B, 0.0, 0
     U, s, _ = np.linalg.svd(B, full_matrices=False)
     kept = s > RANK_TOLERANCE * np.maximum(s[:, :1], 1e-300)
-    log_size = 2.0 * float(np.log(s[kept]).sum())
+    log_size = 2.0 * np.log(s[kept]).sum()
     return U * kept[:, None, :], log_size, int(kept.sum())
 
 
@@ -343,7 +340,7 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     """
     # wide first: the criterion has several minima for a periodic motion
     grid = np.arange(-RANGE_S, RANGE_S + GRID_STEP_S / 2, GRID_STEP_S)
-    lined_up = [line_up(float(offset)) for offset in grid]
+    lined_up = [line_up(offset) for offset in grid]
     ratios = fit(lined_up[len(grid) // 2], prior_sigmas).ratios
     for _ in range(2):
         fits = [fit(stretches, prior_sigmas, ratios) for stretches in lined_up]
@@ -351,7 +348,7 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
         best = int(np.argmin(rss))
         ratios = fit(lined_up[best], prior_sigmas).ratios
     reason = reason_not_unique(grid, rss / fits[best].variance, best)
-    offset_s = float(grid[best])
+    offset_s = grid[best]
     limits = offset_s - 2 * GRID_STEP_S, offset_s + 2 * GRID_STEP_S
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     # ratios of the grid are up to half a step off the best offset: what is not lined up there counts as noise
@@ -387,12 +384,12 @@ def _converge(
         found = fit(
             _with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas, ratios
         )
-        step = float(np.clip(found.parameters[0], -GRID_STEP_S, GRID_STEP_S))
+        step = np.clip(found.parameters[0], -GRID_STEP_S, GRID_STEP_S)
         offset_s = float(np.clip(offset_s + step, *limits))
         if abs(step) < 1e-5:
             break
-    sigma_s = float(np.sqrt(found.covariance[0, 0]))
-    is_settled = abs(float(found.parameters[0])) < max(SETTLED_SIGMAS * sigma_s, 1e-5)
+    sigma_s = np.sqrt(found.covariance[0, 0])
+    is_settled = abs(found.parameters[0]) < max(SETTLED_SIGMAS * sigma_s, 1e-5)
     unsettled = f"it does not settle: after {ROUNDS} steps near {offset_s:+.2f} s the next is {step:+.2g} s"
     return OffsetFit(found, offset_s, "" if is_settled else unsettled)
 

@@ -162,7 +162,7 @@ class DepthGate:
     def __init__(self, calibration: Calibration) -> None:
         start = calibration.start
         world_p_port = start.pose().transformFrom(np.array(calibration.depth.port_m))
-        z_m = float(world_p_port[2])
+        z_m = world_p_port[2]
         is_stated = "position_m" in start.model_fields_set and start.source == "stated"
         length = LATEST_NS // 2 if is_stated else FEWEST - 1
         self._used = DepthChain(
@@ -207,11 +207,11 @@ class DepthGate:
     def _continues(self, samples: DepthSamples, row: int) -> bool:
         """True where a sample out of reach completes a chain of refused samples, which then replaces the used one."""
         used = self._used
-        variance_m2 = float(samples.variance_m2[row])
+        variance_m2 = samples.variance_m2[row]
         if math.isnan(variance_m2):
             variance_m2 = self._unknown_m2
         sample = DepthChain(
-            int(samples.stamps_ns[row]), float(samples.z_m[row]), variance_m2, 1, False
+            int(samples.stamps_ns[row]), samples.z_m[row], variance_m2, 1, False
         )
         near = [
             chain

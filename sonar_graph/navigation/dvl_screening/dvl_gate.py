@@ -60,7 +60,6 @@ class GateResult(NamedTuple):
     """Squared Mahalanobis distance of each row from the last one accepted, shape (n,)."""
     is_outlier: Flags
     """Shape (n,)."""
-    has_outliers: bool
 
 
 def gate_velocities(
@@ -74,8 +73,8 @@ def gate_velocities(
     n = len(rows.stamps_ns)
     distance = np.zeros(n)
     is_outlier = np.zeros(n, np.bool_)
-    has_outliers = _write_gated(rows, known, walk, gate, distance, is_outlier)
-    return GateResult(distance, is_outlier, has_outliers)
+    _write_gated(rows, known, walk, gate, distance, is_outlier)
+    return GateResult(distance, is_outlier)
 
 
 @compiled
@@ -86,9 +85,8 @@ def _write_gated(
     gate: float,
     distance: Floats,
     is_outlier: Flags,
-) -> bool:
-    """Fill the columns of `GateResult`; returns ``has_outliers``."""
-    has_outliers = False
+) -> None:
+    """Fill the columns of `GateResult`."""
     last_ns = LATEST_NS
     u = ZERO
     Q_u = O3
@@ -106,13 +104,10 @@ def _write_gated(
                 u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk
             )
         is_outlier[k] = distance[k] > gate
-        if is_outlier[k]:
-            has_outliers = True
-        else:
+        if not is_outlier[k]:
             last_ns = stamp_ns
             u = v
             Q_u = Q_v
-    return has_outliers
 
 
 @inlined
@@ -159,6 +154,11 @@ MOST_WAITING = 5 * MOST
 """Most rows that wait; beyond, the oldest is refused."""
 
 
+def refusals(rows: list[VelocityRow], reason: Refusal) -> list[RefusedRow]:
+    """Rows that are refused for one reason."""
+    return [RefusedRow("dvl", row.stamp_ns, reason) for row in rows]
+
+
 class Confirmed(NamedTuple):
     """Rows that may go on to the gate, and those that are refused."""
 
@@ -179,9 +179,9 @@ class VelocityConfirmation:
         self._waiting: list[VelocityRow] = []
 
     @property
-    def waiting_ns(self) -> list[int]:
-        """Stamps of the rows that wait."""
-        return [row.stamp_ns for row in self._waiting]
+    def unconfirmed(self) -> list[RefusedRow]:
+        """The rows that wait."""
+        return refusals(self._waiting, Refusal.UNCONFIRMED)
 
     def lets_all_pass(self, stamps_ns: Ints, accepted_ns: Ints) -> bool:
         """True where no row of a block would have to wait, given the rows of it that the gate accepts."""
@@ -208,25 +208,15 @@ class VelocityConfirmation:
         """Add one row; return those, of it and the waiting ones, that may go on."""
         if not self._must_wait(row):
             return Confirmed(VelocityRows.of([row]), [])
-        if row.stamp_ns not in self.waiting_ns:
-            self._waiting = sorted(
-                [*self._waiting, row], key=lambda waiting: waiting.stamp_ns
-            )
-        beyond = self._waiting[:-MOST_WAITING]
-        refused = [
-            RefusedRow("dvl", old.stamp_ns, Refusal.UNCONFIRMED, np.nan)
-            for old in beyond
-        ]
-        self._waiting = self._waiting[-MOST_WAITING:]
+        by_stamp = {old.stamp_ns: old for old in [row, *self._waiting]}
+        waiting = [by_stamp[stamp_ns] for stamp_ns in sorted(by_stamp)]
+        refused = refusals(waiting[:-MOST_WAITING], Refusal.UNCONFIRMED)
+        waiting = waiting[-MOST_WAITING:]
         # a clock that was set meanwhile: rows before the step confirm nothing after it
-        newest_ns = self._waiting[-1].stamp_ns
-        apart = [
-            old.stamp_ns for old in self._waiting if newest_ns - old.stamp_ns > PAUSE_NS
-        ]
-        refused += [
-            RefusedRow("dvl", old_ns, Refusal.CLOCK, np.nan) for old_ns in apart
-        ]
-        self._waiting = self._waiting[len(apart) :]
+        newest_ns = waiting[-1].stamp_ns
+        apart = [old for old in waiting if newest_ns - old.stamp_ns > PAUSE_NS]
+        refused += refusals(apart, Refusal.CLOCK)
+        self._waiting = waiting[len(apart) :]
         chain = self.first_accepted_chain()
         released = self.release(chain, refused) if chain else []
         return Confirmed(VelocityRows.of(released), refused)
@@ -286,10 +276,7 @@ class VelocityConfirmation:
         self._waiting = [row for row in self._waiting if row.stamp_ns > end_ns]
         if is_start:
             return found
-        refused += [
-            RefusedRow("dvl", row.stamp_ns, Refusal.WAITED, np.nan)
-            for row in found[:-1]
-        ]
+        refused += refusals(found[:-1], Refusal.WAITED)
         return found[-1:]
 
     def _instead(self, wrong: VelocityRow, first: VelocityRow) -> VelocityRow:
@@ -304,7 +291,7 @@ class VelocityConfirmation:
         """Squared distance; the slower of the two decides how much turning can change."""
         # S depends on the speed of the earlier row: the smaller of both gives the narrower gate
         fast, slow = sorted(
-            (one, other), key=lambda row: -float(row.velocity @ row.velocity)
+            (one, other), key=lambda row: -(row.velocity @ row.velocity)
         )
         t = abs(other.stamp_ns - one.stamp_ns) * 1e-9
         u = vec(slow.velocity)
@@ -315,4 +302,4 @@ class VelocityConfirmation:
 
 def needed(velocity: Floats) -> int:
     """Number of rows of a chain that are enough for a velocity."""
-    return min(2 + int(float(velocity @ velocity) / USUAL_SPEED_M_S**2), MOST)
+    return min(2 + int((velocity @ velocity) / USUAL_SPEED_M_S**2), MOST)

@@ -83,11 +83,7 @@ class RowIntake:
     @property
     def refused(self) -> list[RefusedRow]:
         """Rows that are not used, and why; includes rows that may still be confirmed."""
-        waiting_ns = self._confirmation.waiting_ns if self._confirmation else []
-        unconfirmed = [
-            RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan)
-            for at_ns in waiting_ns
-        ]
+        unconfirmed = self._confirmation.unconfirmed if self._confirmation else []
         return [*self._refused, *unconfirmed]
 
     def add_imu(self, imu: Imu) -> bool:
@@ -142,9 +138,7 @@ class RowIntake:
         result = self._gated(rows)
         if confirmation is None:
             return self._place(rows, result)
-        accepted_ns = rows.stamps_ns
-        if result.has_outliers:
-            accepted_ns = rows.stamps_ns[~result.is_outlier]
+        accepted_ns = rows.stamps_ns[~result.is_outlier]
         if confirmation.lets_all_pass(rows.stamps_ns, accepted_ns):
             confirmation.accept(accepted_ns)
             return self._place(rows, result)
@@ -202,8 +196,7 @@ class RowIntake:
 
     def _refuse(self, sensor: str, stamps_ns: Ints, reason: Refusal) -> None:
         self._refused += [
-            RefusedRow(sensor, stamp_ns, reason, np.nan)
-            for stamp_ns in stamps_ns.tolist()
+            RefusedRow(sensor, stamp_ns, reason) for stamp_ns in stamps_ns.tolist()
         ]
 
     def _gated(self, rows: VelocityRows) -> GateResult:
@@ -216,8 +209,8 @@ class RowIntake:
         self, rows: VelocityRows, result: GateResult, confirmed_ns: int = EARLIEST_NS
     ) -> bool:
         """Place rows that are no outliers; True as for `add_imu`."""
-        if result.has_outliers:
-            outlier = result.is_outlier
+        outlier = result.is_outlier
+        if outlier.any():
             outlier_ns = rows.stamps_ns[outlier].tolist()
             distances = result.distance[outlier].tolist()
             for stamp_ns, distance in zip(outlier_ns, distances, strict=True):
