@@ -173,7 +173,7 @@ class SightingStack:
             kernel.loss(d)
             for kernel, d in zip(self._kernels, view.lengths, strict=True)
         ]
-        return float(losses.sum())
+        return losses.sum()
 
     def linear_factors(self, values: gtsam.Values) -> list[gtsam.JacobianFactor]:
         """Each factor, linearised, with the weight of its kernel."""
@@ -220,13 +220,13 @@ CorrelatedSighting.Stack = SightingStack
 
 def times(matrices: Floats, vectors: Floats) -> Floats:
     """Product of each matrix with its vector."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+    return (matrices @ vectors[..., None])[..., 0]
 
 
 def poses_of(values: gtsam.Values, keys: NDArray[np.uint64]) -> Floats:
     """Poses of a graph by the keys of keyframes, shape (...): rows of R, and p, shape (..., 12)."""
     known = np.fromiter(values.keys(), np.uint64)
-    poses = np.asarray(gtsam.utilities.extractPose3(values))  # by ascending key
+    poses = gtsam.utilities.extractPose3(values)  # by ascending key
     # the highest byte of a key is its letter
     return poses[np.searchsorted(known[known >> np.uint64(56) == ord("x")], keys)]
 
@@ -278,7 +278,7 @@ def map_prior(
         if jacobians is not None:
             for k in range(len(jacobians)):
                 jacobians[k] = by_coordinates[:, 3 * k : 3 * k + 3]
-        return np.asarray((places - positions_m).ravel())
+        return (places - positions_m).ravel()
 
     # a coordinate that is known exactly still needs a variance
     noise = gaussian(covariance_m2 + EXACT**2 * by_coordinates)
@@ -330,7 +330,7 @@ def landmark_sighting(
         noise would, so that repeating it would invent information.
     """
     robust = robust or GaussianKernel().robust()
-    range_m = float(z[0])
+    range_m = z[0]
     range_sigma_m = math.sqrt(cov[0, 0])
     azimuth_sigma_rad = math.sqrt(cov[1, 1])
     # apart, an outlier in one of them leaves the other its weight
@@ -340,7 +340,7 @@ def landmark_sighting(
     sigmas = np.array([azimuth_sigma_rad, elevation_sigma_rad or UNINFORMATIVE_RAD])
     if is_correlated:
         sigmas[0] = UNINFORMATIVE_RAD  # the azimuth is in the factor with the range
-    sonar_R_camera = gtsam.Rot3.Rz(float(z[1])).compose(BEAM_R_CAMERA)
+    sonar_R_camera = gtsam.Rot3.Rz(z[1]).compose(BEAM_R_CAMERA)
     body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
     noise = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
     camera = gtsam.GenericProjectionFactorCal3Fisheye(
@@ -383,7 +383,7 @@ def first_direction(
     body_p_landmark
         In the keyframe's body frame, shape (3,), m.
     """
-    range_m = float(np.linalg.norm(body_p_landmark))
+    range_m = np.linalg.norm(body_p_landmark)
     # both components of the direction, then the range
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))
     return gtsam.BearingRangeFactor3D(
@@ -543,7 +543,7 @@ def position_with_biases(
             jacobians[1] = (
                 by_motion @ gtsam.Pose3.ExpmapDerivative(change) @ motion.D_bias
             )
-        return np.asarray(world_T_i.transformFrom(arm)) - position_m
+        return world_T_i.transformFrom(arm) - position_m
 
     return gtsam.CustomFactor(robust(gaussian(cov_m2)), [pose_key, bias_key], error)
 

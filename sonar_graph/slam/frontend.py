@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
-from sonar_graph.models import KernelParams
+from sonar_graph.models import KernelParams, polar_measurements
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks import (
     AmendableJournal,
@@ -159,16 +159,8 @@ class Frontend:
             why is None or (why in UNIDENTIFIED and waits)
             for why, waits in zip(refusals, may_wait, strict=True)
         ]
-        z = np.array((detections.range_m, detections.azimuth_rad)).T.copy()
-        noise = detections.range_azimuth_cov
-        # then the calibration's noise holds
-        is_unknown = np.isnan(noise)
-        if is_unknown.any():
-            sonar = self._keyframes.calibration.sonar
-            noise = noise.copy()
-            noise[is_unknown.any(axis=(1, 2))] = np.diag(
-                [sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]
-            )
+        sonar = self._keyframes.calibration.sonar
+        z, noise = polar_measurements(detections, sonar)
         frame = Frame(detections, stamp_ns, rows, ids, tracks, refusals, z, noise)
         return frame.select(is_open)
 

@@ -222,7 +222,8 @@ class Keyframes:
         lag_s = min(smoother.params.lag_s, LONGEST_LATE_S)
         self._lag_ns = round(lag_s * NS_PER_S)
         self._bias_since_ns = 0
-        self._newest_key = X(0)
+        self.newest_key = X(0)
+        """Key of the newest keyframe."""
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._linearised: Linearisation
         self._depths: list[Depth] = []
@@ -242,11 +243,6 @@ class Keyframes:
     def newest_s(self) -> float:
         """Stamp of the newest keyframe in seconds, as the smoother counts them."""
         return self.stamps_ns[-1] * S_PER_NS
-
-    @property
-    def newest_key(self) -> int:
-        """Key of the newest keyframe."""
-        return self._newest_key
 
     def tie(self, motion: PreintegratedMotion) -> Tie:
         """An instant that the motion from the newest keyframe leads to."""
@@ -306,7 +302,7 @@ class Keyframes:
 
     def refuse(self, sensor: str, stamp_ns: int, reason: Refusal) -> None:
         """Record a row that is not used."""
-        self._refused.append(RefusedRow(sensor, stamp_ns, reason, np.nan))
+        self._refused.append(RefusedRow(sensor, stamp_ns, reason))
 
     @property
     def refused(self) -> list[RefusedRow]:
@@ -423,7 +419,7 @@ class Keyframes:
         # the factors up to here hold for the biases of keyframe i
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
-        self._newest_key = X(j)
+        self.newest_key = X(j)
         self._constrain(j)
         self.odometry.settle(node_ns)
         # a late fix may need the motion from any keyframe of the lag
@@ -455,7 +451,7 @@ class Keyframes:
 
     def bias(self, index: int) -> Floats:
         """Newest estimate of the biases that hold from a keyframe on, shape (11,)."""
-        return np.asarray(self.smoother.estimates.atVector(self.bias_keys[index]))
+        return self.smoother.estimates.atVector(self.bias_keys[index])
 
     # ---------------------------------------------------------------- motion
 
@@ -532,7 +528,7 @@ class Keyframes:
             return
         velocity_i, variance_i = self.odometry.velocity_at_imu(self.stamps_ns[-1])
         velocity_j, variance_j = self.odometry.velocity_at_imu(node_ns)
-        sigma_m_s = float(np.sqrt(0.5 * (variance_i + variance_j)))
+        sigma_m_s = np.sqrt(0.5 * (variance_i + variance_j))
         # the bias is a variable of the graph, or has no sigma: it is no noise of the direction
         direction = gravity_direction(
             motion, velocity_i, velocity_j, sigma_m_s, self.calibration, has_bias=False
@@ -624,7 +620,7 @@ class Keyframes:
         )
         # beyond k sigma the noise grows with the error: R d / k
         average = average_at_end(sigma_rad**2 * np.maximum(1.0, off), wander_rad2)
-        measured_rad = float(yaw_rad[-1] + compass_rad + average.weights @ innovation)
+        measured_rad = yaw_rad[-1] + compass_rad + average.weights @ innovation
         factor = factors.heading(
             X(j), self.bias_keys[-1], measured_rad, average.variance**0.5
         )
@@ -636,7 +632,7 @@ class Keyframes:
             missed_rad = wrap_angle(
                 innovation + compass_rad + yaw_rad[-1] - np.arctan2(y, x)
             )
-            return np.asarray(np.abs(missed_rad) / np.hypot(sigma_rad, bias_sigma_rad))
+            return np.abs(missed_rad) / np.hypot(sigma_rad, bias_sigma_rad)
 
         self._unjudged.append(("heading", distances))
 
@@ -693,9 +689,7 @@ class Keyframes:
             by_pose = body_point_jacobian(world_R_i, arm)
             P = self.smoother.joint_covariance([X(i)]).at(X(i), X(i))
             predicted_m2 = by_pose @ P @ by_pose.T  # (3, 3)
-            gain = FIX_GAIN * float(
-                (predicted_m2.diagonal() / spread_m2.diagonal()).max()
-            )
+            gain = FIX_GAIN * (predicted_m2.diagonal() / spread_m2.diagonal()).max()
         self.smoother.add({"position": factor}, gain=gain)
 
         def distance(values: Known) -> Floats:

@@ -13,12 +13,10 @@ P is the joint covariance of (X, b). With the sonar mounted at T, a landmark p i
 Here P is the joint covariance of (X, b, p), H_M the derivative by the body's pose at the instant.
 
 The tie of an instant to its keyframe is kept while the keyframe may still change. Once it leaves a bounded window, only
-the pose is kept: 232 bytes for each instant.
+the pose is kept.
 """
 
 import math
-from array import array
-from bisect import bisect_left
 from dataclasses import dataclass
 from itertools import groupby
 from typing import NamedTuple
@@ -27,7 +25,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models import Mount, sight_of, wrap_angle
+from sonar_graph.models import Mount, polar_difference, sight_of
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import (
     LOWER_LEFT,
@@ -37,6 +35,7 @@ from sonar_graph.numerics import (
     Vec6,
     compiled,
     cross,
+    diagonal_blocks,
     inlined,
     innovation_of,
     mat,
@@ -50,7 +49,6 @@ from sonar_graph.numerics import (
 from sonar_graph.slam.smoother import JointCovariance, Known, Marginals
 from sonar_graph.states import Estimate, Trajectory
 
-TRIANGLE = np.tril_indices(6)
 NO_BIASES = np.zeros((6, 0))
 """D of a motion that does not depend on biases."""
 
@@ -106,15 +104,12 @@ class AnchoredPose:
 
 
 class PoseHistory:
-    """Instants in the order of time: first those whose pose is final, in columns, then those that may still change."""
+    """Instants in the order of time: first those whose pose is final, then those that may still change."""
 
     def __init__(self) -> None:
+        self._final: list[Trajectory] = []
+        """Poses that left the window, of each time together."""
         self._open: list[AnchoredPose] = []
-        self._stamps_ns = array("q")
-        self._poses = array("d")
-        """Position and quaternion, seven numbers for each instant."""
-        self._triangles = array("d")
-        """Lower triangle of the covariance, 21 numbers for each instant."""
 
     @property
     def newest_ns(self) -> int | None:
@@ -133,41 +128,27 @@ class PoseHistory:
         while count < len(self._open) and self._open[count].tie.pose_key in pose_keys:
             count += 1
         if count:
-            part = Trajectory.from_estimates(
-                _estimates(self._open[:count], values, marginals)
-            )
-            i, j = TRIANGLE
-            self._stamps_ns.extend(part.stamps_ns.tolist())
-            self._poses.extend(
-                np.hstack([part.positions, part.quaternions_xyzw]).ravel().tolist()
-            )
-            self._triangles.extend(part.covariances[:, i, j].ravel().tolist())
+            leaving = _estimates(self._open[:count], values, marginals)
+            self._final.append(Trajectory.from_estimates(leaving))
         del self._open[:count]
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop older final poses."""
-        count = bisect_left(self._stamps_ns, stamp_ns)
-        del self._stamps_ns[:count]
-        del self._poses[: 7 * count]
-        del self._triangles[: 21 * count]
+        while self._final and self._final[0].stamps_ns[-1] < stamp_ns:
+            del self._final[0]
+        if self._final:
+            first = int(self._final[0].stamps_ns.searchsorted(stamp_ns))
+            self._final[0] = self._final[0].rows(slice(first, None))
 
     def trajectory(self, values: Known, marginals: Marginals) -> Trajectory:
         """Poses at all instants."""
         rest = Trajectory.from_estimates(_estimates(self._open, values, marginals))
-        n = len(self._stamps_ns)
-        if n == 0:  # the usual case of a whole history
-            return rest
-        poses = np.array(self._poses).reshape(n, 7)
-        covariances = np.empty((n, 6, 6))
-        i, j = TRIANGLE
-        triangles = np.array(self._triangles).reshape(n, -1)  # (n, 21)
-        covariances[:, i, j] = triangles
-        covariances[:, j, i] = triangles
+        parts = [*self._final, rest]
         return Trajectory(
-            np.concatenate([np.array(self._stamps_ns), rest.stamps_ns]),
-            np.concatenate([poses[:, :3], rest.positions]),
-            np.concatenate([poses[:, 3:], rest.quaternions_xyzw]),
-            np.concatenate([covariances, rest.covariances]),
+            np.concatenate([part.stamps_ns for part in parts]),
+            np.concatenate([part.positions for part in parts]),
+            np.concatenate([part.quaternions_xyzw for part in parts]),
+            np.concatenate([part.covariances for part in parts]),
         )
 
 
@@ -261,10 +242,7 @@ class PredictedView:
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
         expected, joint = self.expect_jointly(keys, points, [])
-        m = len(keys)
-        place = np.arange(m)
-        # blocks on the diagonal
-        return expected, joint.reshape(m, 2, m, 2)[place, :, place]
+        return expected, diagonal_blocks(joint, 2)
 
     def expect_jointly(
         self, keys: list[int], points: Floats, sources: list[Source]
@@ -321,38 +299,12 @@ def with_sources(covariance: JointCovariance, sources: list[Source]) -> Floats:
 
 def weigh(z: Floats, expected: Floats, joint: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its joint covariance, shape (2 m, 2 m)."""
-    m = len(z)
-    found = Compared(np.empty((m, 2)), np.empty((m, 2, 2)), np.empty(m), np.empty(m))
-    write_compared(z, expected, joint, cov, (*found,))
-    return found
-
-
-@compiled
-def write_compared(
-    z: Floats,
-    expected: Floats,
-    joint: Floats,
-    cov: Floats,
-    found: tuple[Floats, Floats, Floats, Floats],
-) -> None:
-    """Fill the columns of `Compared`."""
-    innovation, S, distance, gain = found
-    for k in range(len(z)):
-        r = z[k, 0] - expected[k, 0]
-        alpha = wrap_angle(z[k, 1] - expected[k, 1])
-        innovation[k, 0] = r
-        innovation[k, 1] = alpha
-        for i in range(2):
-            for j in range(2):
-                S[k, i, j] = joint[2 * k + i, 2 * k + j] + cov[k, i, j]
-        a = S[k, 0, 0]
-        b = S[k, 0, 1]
-        c = S[k, 1, 1]
-        # e' S^-1 e with the closed inverse of a 2 x 2 matrix
-        squares = c * r**2 - 2.0 * b * r * alpha + a * alpha**2
-        distance[k] = squares / (a * c - b**2)
-        of_range = joint[2 * k, 2 * k] / cov[k, 0, 0]
-        gain[k] = max(of_range, joint[2 * k + 1, 2 * k + 1] / cov[k, 1, 1])
+    S_0 = diagonal_blocks(joint, 2)
+    innovation = polar_difference(z, expected)
+    S = S_0 + cov
+    weighed = np.linalg.solve(S, innovation[..., None])[..., 0]
+    ratios = np.diagonal(S_0, axis1=1, axis2=2) / np.diagonal(cov, axis1=1, axis2=2)
+    return Compared(innovation, S, np.vecdot(innovation, weighed), ratios.max(axis=1))
 
 
 @inlined

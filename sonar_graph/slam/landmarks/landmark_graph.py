@@ -261,6 +261,18 @@ class State(NamedTuple):
 UNJUDGED = State()
 
 
+def age(sighting: Sighting) -> tuple[int, int]:
+    """Sorts sightings by time, those of a frame by their rows."""
+    return sighting.stamp_ns, sighting.row
+
+
+def prior_of_map(known: KnownMap) -> FactorGroup:
+    """Joint prior of the landmarks of a map."""
+    keys = [L(landmark_id) for landmark_id in known.ids]
+    prior = map_prior(keys, np.array(known.positions_m), known.joint())
+    return FactorGroup({"map prior": prior})
+
+
 class LandmarkGraph:
     """Sightings with their states and landmarks, and the journal of all detections."""
 
@@ -325,11 +337,10 @@ class LandmarkGraph:
         """Add the landmarks of the map with their joint prior, once the graph has its first keyframe."""
         if not self.known.held or self._map_prior is not None:
             return
-        keys = [L(i) for i in self.known.ids]
-        for key, place in zip(keys, self.known.places(), strict=True):
-            self.smoother.add_landmark(key, place)
-        prior = map_prior(keys, self.known.places(), self.known.joint())
-        self._map_prior = self.smoother.add({"map prior": prior})
+        assert self.known.map is not None
+        for landmark_id, place in zip(self.known.ids, self.known.places(), strict=True):
+            self.smoother.add_landmark(L(landmark_id), place)
+        self._map_prior = self.smoother.add(prior_of_map(self.known.map))
         self.follow(self.smoother.flush(time_s))
 
     def release(self, landmark_ids: Sequence[int], time_s: float) -> None:
@@ -339,17 +350,12 @@ class LandmarkGraph:
         for landmark_id in landmark_ids:
             del self._of[landmark_id]
             del self._rooted[landmark_id]
-        rows = [k for k, i in enumerate(self.known.ids) if i in self.known.held]
-        groups = []
-        if rows:
-            coordinates = np.add.outer(3 * np.array(rows), np.arange(3)).ravel()
-            prior = map_prior(
-                [L(self.known.ids[k]) for k in rows],
-                self.known.places()[rows],
-                self.known.joint()[np.ix_(coordinates, coordinates)],
-            )
-            groups.append(FactorGroup({"map prior": prior}))
         assert self._map_prior is not None
+        assert self.known.map is not None
+        groups = []
+        if self.known.held:
+            moved = set(self.known.ids) - self.known.held
+            groups.append(prior_of_map(self.known.map.without(moved)))
         changed = self.smoother.exchange(
             time_s, [self._map_prior], groups, lost_landmarks=[*map(L, landmark_ids)]
         )
@@ -461,43 +467,41 @@ class LandmarkGraph:
         """
         # only factors that have entered the smoother can be taken out
         self.follow(self.smoother.flush(time_s))
-        old_of: dict[Sighting, int] = {}
+        entering = dict(associated)
+        leaving: list[Sighting] = []
+        affected = set(entering.values())
         for sighting in retracted:
             landmark_id = self.state(sighting).landmark_id
             if landmark_id is not None:  # the flush may have withheld it
-                old_of[sighting] = landmark_id
-        new_of = dict(associated)
-        first_before = {
-            i: self._first(i) for i in sorted({*old_of.values(), *new_of.values()})
-        }
-        removed = [self.state(sighting).handle for sighting in old_of]
-        for sighting in old_of:
+                leaving.append(sighting)
+                affected.add(landmark_id)
+        before = self._roles(affected)
+        existed = self._of.keys() & affected
+        handle_of = {sighting: self.state(sighting).handle for sighting in before}
+        for sighting in leaving:
             self._remove(sighting)
-        for sighting, new_id in new_of.items():
+        for sighting, new_id in entering.items():
             self._insert(sighting, new_id, None)
-        first = {i: self._first(i) for i in first_before}
+        after = self._roles(affected)
         # a sighting that becomes the first of its landmark, or no longer is, gets other factors
-        remade = {
-            s: i
-            for i, before in first_before.items()
-            if first[i] is not before
-            for s in (before, first[i])
-            if s is not None and s not in new_of and self.state(s).landmark_id == i
-        }
-        removed += [self.state(sighting).handle for sighting in remade]
+        remade = [
+            sighting
+            for sighting, role in after.items()
+            if sighting not in entering and role != before[sighting]
+        ]
         made: dict[Sighting, FactorGroup] = {}
-        for sighting, i in (new_of | remade).items():
-            group = self.factors.make(sighting, L(i), is_first=sighting is first[i])
+        for sighting in [*entering, *remade]:
+            i, is_first = after[sighting]
+            group = self.factors.make(sighting, L(i), is_first=is_first)
             made[sighting] = FactorGroup(group, (L(i), sighting.line))
         begun = {
-            L(i): self.factors.start(s, self.smoother.estimates)
-            for i, s in first.items()
-            if s is not None and first_before[i] is None
+            L(i): self.factors.start(sighting, self.smoother.estimates)
+            for sighting, (i, is_first) in after.items()
+            if is_first and i not in existed
         }
         # a landmark without sightings would be undetermined
-        lost = [
-            L(i) for i, s in first.items() if s is None and first_before[i] is not None
-        ]
+        lost = [L(i) for i in sorted(existed) if i not in self]
+        removed = [handle_of[sighting] for sighting in [*leaving, *remade]]
         handles = [handle for handle in removed if handle is not None]
         changed = self.smoother.exchange(
             time_s, handles, list(made.values()), begun, lost
@@ -506,15 +510,17 @@ class LandmarkGraph:
             self._states[sighting] = self._states[sighting]._replace(handle=handle)
         self.follow(changed)
 
-    def _first(self, landmark_id: int) -> Sighting | None:
-        """Sighting that has the factors that a landmark has once."""
-        if landmark_id in self._rooted:  # its factors are final
-            return self._rooted[landmark_id]
-        return min(
-            self._of.get(landmark_id, {}),
-            key=lambda s: (s.stamp_ns, s.row),
-            default=None,
-        )
+    def _roles(self, landmark_ids: Set[int]) -> dict[Sighting, tuple[int, bool]]:
+        """Sightings of some landmarks: its landmark, and True for the one with the factors that this has once."""
+        roles = {}
+        for landmark_id in sorted(landmark_ids):
+            sightings = self._of.get(landmark_id, {})
+            # of a rooted landmark these factors are final
+            is_rooted = landmark_id in self._rooted
+            first = None if is_rooted else min(sightings, key=age, default=None)
+            for sighting in sightings:
+                roles[sighting] = (landmark_id, sighting is first)
+        return roles
 
     def _insert(self, sighting: Sighting, landmark_id: int, handle: int | None) -> None:
         self._states[sighting] = State(

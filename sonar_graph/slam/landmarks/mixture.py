@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 
@@ -38,7 +37,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.models import Kernel, polar_difference, project_points
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.smoother import Known
+from sonar_graph.slam.smoother import Known, sighted_from
 
 REPEATED_LOSS = 3.0
 """Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
@@ -100,7 +99,7 @@ class IdentityPosterior:
         # half of the errors are of another landmark, each as probable as the next, half of none
         w = (1.0 - q) * p + 0.5 * q / max(len(ids), LEAST_LANDMARKS)
         w_none = (1.0 - q) * missing + 0.5 * q
-        return np.asarray(np.log(np.append(w, w_none)))
+        return np.log(np.append(w, w_none))
 
 
 @dataclass(eq=False)
@@ -122,38 +121,6 @@ Scores = dict[int | None, float]
 """Log density l of each component of a tracked object; None: no landmark."""
 
 
-class Errors:
-    """Whitened errors of n sightings against landmarks, for poses as they are estimated."""
-
-    def __init__(self, sightings: Sequence[Sighting], values: Known) -> None:
-        poses = {
-            key: values.atPose3(key)
-            for key in {sighting.line.pose_key for sighting in sightings}
-        }
-        world_T_sonar = [
-            poses[s.line.pose_key].compose(s.line.body_T_sonar).matrix()
-            for s in sightings
-        ]
-        sonars = np.array(world_T_sonar).reshape(-1, 4, 4)
-        noise = np.array([sighting.noise for sighting in sightings]).reshape(-1, 2, 2)
-        self._world_R_sonar = sonars[:, :3, :3]
-        self._world_p_sonar = sonars[:, :3, 3]
-        self._z = np.array([sighting.line.z for sighting in sightings]).reshape(-1, 2)
-        self._whitener = np.linalg.inv(np.linalg.cholesky(noise))
-        self.half_log_det = 0.5 * np.linalg.slogdet(noise)[1]
-        """Of each sighting's noise, shape (n,)."""
-
-    def of(self, points: Floats) -> Floats:
-        """Against landmarks at points of the world, shape (K, 3): range and azimuth, shape (n, K, 2)."""
-        from_sonar = points[None] - self._world_p_sonar[:, None]
-        # R^T (p - t), in sonar axes
-        q = np.einsum("nji,nkj->nki", self._world_R_sonar, from_sonar)
-        expected, _ = project_points(q.reshape(-1, 3))
-        # (n, K, 2)
-        e = polar_difference(expected.reshape(*q.shape[:2], 2), self._z[:, None])
-        return np.einsum("nij,nkj->nki", self._whitener, e)
-
-
 class Mixture:
     """Log densities of tracked objects, from the recogniser's error rate and the kernel of a sighting's noise."""
 
@@ -172,12 +139,9 @@ class Mixture:
     ) -> Scores:
         """Components of a detection that the state is not yet conditioned on, with its innovation covariances S."""
         e = polar_difference(z, expected)  # (K, 2)
-        whitener = np.linalg.inv(np.linalg.cholesky(S))
-        losses = self._kernel.loss(np.einsum("kij,kj->ki", whitener, e)).sum(axis=1)
-        half_log_det = 0.5 * np.linalg.slogdet(S)[1]
         new = [i for i in posterior.probability if i not in set(ids)]
         totals = posterior.log_weights(ids + new, self._errors)
-        totals[: len(ids)] += self._log_peak - half_log_det - losses
+        totals[: len(ids)] += self._log_density(e[:, None], S)[:, 0]
         # a landmark that is not in the graph may be anywhere in view, as may what is no landmark
         totals[len(ids) :] += self._errors.log_density
         return dict(zip([*ids, *new, None], totals.tolist(), strict=True))
@@ -278,21 +242,29 @@ class Mixture:
             totals.append(log_u + repeated.sum())
         return np.array(totals)
 
+    def _log_density(self, e: Floats, cov: Floats) -> Floats:
+        """Log densities of errors, shape (n, k, 2), whose covariances are of shape (n, 2, 2): (n, k)."""
+        whitener = np.linalg.inv(np.linalg.cholesky(cov))
+        losses = self._kernel.loss(np.einsum("nij,nkj->nki", whitener, e)).sum(axis=2)
+        half_log_det = 0.5 * np.linalg.slogdet(cov)[1]
+        return self._log_peak - half_log_det[:, None] - losses
+
     def _fits(
         self, objects: list[TrackedObject], points: Floats, values: Known
     ) -> Floats:
         """Log densities of tracked objects, for landmarks at points of the world, shape (n, k)."""
-        errors = Errors(
-            [sighting for each in objects for sighting in each.sightings], values
-        )
-        losses = self._kernel.loss(errors.of(points)).sum(axis=2)
-        # (sightings, k)
-        single = self._log_peak - errors.half_log_det[:, None] - losses
+        sightings = [sighting for each in objects for sighting in each.sightings]
+        views = sighted_from(values, [sighting.line for sighting in sightings])
+        q = views.in_sonar(points)  # (sightings, k, 3)
+        expected, _ = project_points(q.reshape(-1, 3))
+        e = polar_difference(expected.reshape(*q.shape[:2], 2), views.z[:, None])
+        noise = np.array([sighting.noise for sighting in sightings])
+        single = self._log_density(e, noise)  # (sightings, k)
         # sum over the sightings of each object, which follow each other
         starts = list(
             accumulate((len(each.sightings) for each in objects[:-1]), initial=0)
         )
-        return np.asarray(np.add.reduceat(single, starts, axis=0))
+        return np.add.reduceat(single, starts, axis=0)
 
 
 def each_once(scores: list[Scores], stamps_ns: list[set[int]]) -> Choices:
@@ -329,12 +301,13 @@ def supporters_elsewhere(
     mixture: Mixture,
 ) -> list[TrackedObject] | None:
     """Tracked objects that agree on a better place for the landmark that they name; None: no better place."""
-    voters = objects[-MOST_VOTERS:]
-    others = [
-        each
+    naming = [
+        (each, choice)
         for each, choice in zip(objects, choices, strict=True)
-        if choice != landmark_id
+        if each.posterior.favourite == landmark_id
     ]
+    voters = [each for each, _ in naming[-MOST_VOTERS:]]
+    others = [each for each, choice in naming if choice != landmark_id]
     proposals = [
         each.sightings[0].line.point(values) for each in others[-MOST_PROPOSALS:]
     ]

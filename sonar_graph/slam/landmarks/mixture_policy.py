@@ -29,6 +29,7 @@ from sonar_graph.slam.landmarks.landmark_graph import (
     IdentityPolicy,
     LandmarkGraph,
     Solution,
+    age,
 )
 from sonar_graph.slam.landmarks.mixture import (
     Choices,
@@ -46,7 +47,7 @@ from sonar_graph.slam.landmarks.tracked import (
     RobustIdentity,
     second_rows_of_tracks,
 )
-from sonar_graph.slam.smoother import Marginals, Sightline, solve_in_sight
+from sonar_graph.slam.smoother import Marginals, Sightline, solve
 from sonar_graph.states import Outcome
 
 MOST_WINDOW_ROUNDS = 3
@@ -324,19 +325,17 @@ class MixtureIdentities(IdentityPolicy):
             self._disputed.discard(landmark_id)
             if landmark_id not in self.landmarks:
                 continue
-            naming = [
-                each for each in self.objects if each.posterior.favourite == landmark_id
-            ]
-            choices = [self.landmark_of(each) for each in naming]
+            choices = [self.landmark_of(each) for each in self.objects]
+            values = self.smoother.estimates
             supporters = supporters_elsewhere(
-                landmark_id, naming, choices, self.smoother.estimates, self.mixture
+                landmark_id, self.objects, choices, values, self.mixture
             )
             if supporters is not None:
                 leaving = _assigned(
                     [
                         (each, None)
-                        for each in self.objects
-                        if self.landmark_of(each) == landmark_id
+                        for each, choice in zip(self.objects, choices, strict=True)
+                        if choice == landmark_id
                     ]
                 )
                 coming = _assigned([(each, landmark_id) for each in supporters])
@@ -461,17 +460,8 @@ class MixtureIdentities(IdentityPolicy):
         """Begin landmarks that began with something else where those that name them agree that they are."""
         moved = gtsam.Values(values)
         for landmark_id in sorted(_sizes(objects, choices)):
-            named = [each.posterior.favourite == landmark_id for each in objects]
-            naming = [
-                each for each, is_named in zip(objects, named, strict=True) if is_named
-            ]
-            present = [
-                choice
-                for choice, is_named in zip(choices, named, strict=True)
-                if is_named
-            ]
             supporters = supporters_elsewhere(
-                landmark_id, naming, present, values, self.mixture
+                landmark_id, objects, choices, values, self.mixture
             )
             if supporters is None:
                 continue
@@ -480,7 +470,7 @@ class MixtureIdentities(IdentityPolicy):
                 landmark_id if each in supporters else choice
                 for each, choice in zip(objects, without, strict=True)
             ]
-            first = min((s for each in supporters for s in each.sightings), key=_age)
+            first = min((s for each in supporters for s in each.sightings), key=age)
             moved.update(L(landmark_id), self.landmarks.factors.start(first, values))
         return moved, choices
 
@@ -493,17 +483,14 @@ class MixtureIdentities(IdentityPolicy):
     ) -> gtsam.Values:
         """Solution of the history in which each tracked object is the landmark chosen for it."""
         start = gtsam.Values(values)
-        lines: dict[int, list[Sightline]] = defaultdict(list)
-        for each, choice in zip(objects, choices, strict=True):
-            if choice is None:
-                continue
-            lines[L(choice)] += [sighting.line for sighting in each.sightings]
+        lines: dict[int, list[Sightline]] = {}
+        for landmark_id, sightings in _by_choice(objects, choices).items():
+            key = L(landmark_id)
+            lines[key] = [sighting.line for sighting in sightings]
             # a landmark that the run does not have begins where its first object has it
-            if not start.exists(L(choice)):
-                start.insert(
-                    L(choice), self.landmarks.factors.start(each.sightings[0], values)
-                )
-        return solve_in_sight(self.graph(rest, objects, choices), start, lines)
+            if not start.exists(key):
+                start.insert(key, self.landmarks.factors.start(sightings[0], values))
+        return solve(self.graph(rest, objects, choices), start, lines)
 
     def graph(
         self,
@@ -513,13 +500,9 @@ class MixtureIdentities(IdentityPolicy):
     ) -> gtsam.NonlinearFactorGraph:
         """All factors, those of sightings as chosen."""
         graph = gtsam.NonlinearFactorGraph(rest)
-        of: dict[int, list[Sighting]] = defaultdict(list)
-        for each, choice in zip(objects, choices, strict=True):
-            if choice is not None:
-                of[choice] += each.sightings
-        for landmark_id, sightings in of.items():
+        for landmark_id, sightings in _by_choice(objects, choices).items():
             # as in `LandmarkGraph`, the earliest has the factors that a landmark has once
-            for k, sighting in enumerate(sorted(sightings, key=_age)):
+            for k, sighting in enumerate(sorted(sightings, key=age)):
                 for factor in self.landmarks.factors.make(
                     sighting, L(landmark_id), is_first=k == 0
                 ).values():
@@ -545,14 +528,17 @@ def _assigned(changes: Changes) -> list[Assignment]:
     ]
 
 
-def _age(sighting: Sighting) -> tuple[int, int]:
-    return sighting.stamp_ns, sighting.row
-
-
 def _sizes(objects: list[TrackedObject], choices: Choices) -> dict[int, int]:
     """Number of sightings of each chosen landmark."""
-    sizes: dict[int, int] = defaultdict(int)
+    return {i: len(shown) for i, shown in _by_choice(objects, choices).items()}
+
+
+def _by_choice(
+    objects: list[TrackedObject], choices: Choices
+) -> dict[int, list[Sighting]]:
+    """Sightings of each chosen landmark."""
+    sightings: dict[int, list[Sighting]] = defaultdict(list)
     for each, choice in zip(objects, choices, strict=True):
         if choice is not None:
-            sizes[choice] += len(each.sightings)
-    return sizes
+            sightings[choice] += each.sightings
+    return sightings

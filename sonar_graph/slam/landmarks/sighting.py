@@ -109,9 +109,7 @@ class SightingFactors:
         if floor is None:
             return 0.0
         return (
-            elevation_on_floor(
-                world_T_sonar, float(z[0]), float(z[1]), floor.z_m, self._aperture_rad
-            )
+            elevation_on_floor(world_T_sonar, z[0], z[1], floor.z_m, self._aperture_rad)
             or 0.0
         )
 

@@ -391,7 +391,7 @@ class TrackedIdentities(IdentityPolicy):
             points = np.where(mask, seen.beam_points(rows), landmarks)
         judged = []
         for k, sighting in enumerate(seen.sightings(rows, points)):
-            squared = float(compared.distance[k])
+            squared = compared.distance[k]
             landmark_id = frame.ids[rows[k]]
             verdict = self.landmarks.known.judge(
                 landmark_id, frame.stamp_ns, compared.innovation[k], compared.S[k]
@@ -406,7 +406,7 @@ class TrackedIdentities(IdentityPolicy):
                     landmark_id,
                     compared.innovation[k],
                     compared.S[k],
-                    gain=float(compared.gain[k]) if is_inside else 0.0,
+                    gain=compared.gain[k] if is_inside else 0.0,
                 )
             )
         return judged
@@ -453,8 +453,8 @@ def second_rows_of_tracks(
         is_landmark = frame.candidate_ids[row] >= 0
         ids = frame.candidate_ids[row, is_landmark]
         posterior = frame.id_probability[row, is_landmark]
-        of_identity = float(posterior[ids == identities.get(track, UNDECIDED)].sum())
-        score = (of_identity, float(posterior.max(initial=0.0)), -row)
+        of_identity = posterior[ids == identities.get(track, UNDECIDED)].sum()
+        score = (of_identity, posterior.max(initial=0.0), -row)
         best[track] = max(best.get(track, score), score)
     return [
         None if track == NO_TRACK or -best[track][2] == row else Outcome.TRACK_REPEATED

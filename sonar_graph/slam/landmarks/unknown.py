@@ -36,7 +36,7 @@ from sonar_graph.models import (
     polar_difference,
     range_azimuth_jacobians,
 )
-from sonar_graph.numerics import chi_square_quantile
+from sonar_graph.numerics import chi_square_quantile, diagonal_blocks
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmarks.landmark_graph import (
     UNCHANGED,
@@ -101,11 +101,10 @@ class Innovations:
 
     def distances(self) -> Floats:
         """D² of each detection with each landmark alone, shape (m, n)."""
-        n = self.innovation.shape[1]
-        own = self.expected_cov.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n), :]
+        own = diagonal_blocks(self.expected_cov, 2)
         S = own[None] + self.noise[:, None]  # (m, n, 2, 2)
         weighed = np.linalg.solve(S, self.innovation[..., None])[..., 0]
-        return np.asarray(np.einsum("mni,mni->mn", self.innovation, weighed))
+        return np.einsum("mni,mni->mn", self.innovation, weighed)
 
 
 def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
@@ -204,7 +203,7 @@ def drop_unlikely(
         excess = np.array(given_others) - log_rivals[paired]
         worst = int(np.argmin(excess))
         if excess[worst] > 0:
-            is_likely = log_density(e, C) > float(log_rivals[paired].sum())
+            is_likely = log_density(e, C) > log_rivals[paired].sum()
             return innovations.pairing(landmarks) if is_likely else nothing
         landmarks = tuple(
             UNPAIRED if i == paired[worst] else j for i, j in enumerate(landmarks)
@@ -214,10 +213,8 @@ def drop_unlikely(
 
 def log_density(e: Floats, C: Floats) -> float:
     """Logarithm of ``N(e; 0, C)``."""
-    log_det = float(np.linalg.slogdet(C)[1])
-    return -0.5 * (
-        float(e @ np.linalg.solve(C, e)) + log_det + len(e) * math.log(2 * math.pi)
-    )
+    log_det = np.linalg.slogdet(C)[1]
+    return -0.5 * (e @ np.linalg.solve(C, e) + log_det + len(e) * math.log(2 * math.pi))
 
 
 ROUNDING_S = 1e-3
@@ -353,7 +350,7 @@ class NamelessLandmarks(IdentityPolicy):
         ):
             if pair.landmark_id is not None and pair.S is not None:
                 # S = S_0 + R
-                gain = float((np.diag(pair.S) / np.diag(sighting.noise)).max()) - 1.0
+                gain = (np.diag(pair.S) / np.diag(sighting.noise)).max() - 1.0
                 judged.append(
                     Assignment(
                         sighting,
@@ -500,7 +497,7 @@ def nearest_duplicates(
     of_b = np.array([covariance.rows[L(b)] for _, b in pairs])[:, None] + np.arange(3)
 
     def P(i: NDArray[np.int64], j: NDArray[np.int64]) -> Floats:
-        return np.asarray(covariance.matrix[i[:, :, None], j[:, None, :]])  # (k, 3, 3)
+        return covariance.matrix[i[:, :, None], j[:, None, :]]  # (k, 3, 3)
 
     S = (
         P(of_a, of_a)
@@ -524,9 +521,7 @@ def nearest_duplicates(
 
 def _noise_m2(sighting: Sighting) -> float:
     """Variance of a sighting across or along its beam, whichever is larger, m²."""
-    return float(
-        max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1])
-    )
+    return max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1])
 
 
 def source(sighting: Sighting, values: Known, factors: SightingFactors) -> Source:
@@ -541,7 +536,7 @@ def source(sighting: Sighting, values: Known, factors: SightingFactors) -> Sourc
         sighting.floor, X.compose(line.body_T_sonar), line.z
     )
     point, by_pose, by_polar = locate_jacobians(
-        X, line.body_T_sonar, float(line.z[0]), float(line.z[1]), elevation
+        X, line.body_T_sonar, line.z[0], line.z[1], elevation
     )
     polar_cov = np.zeros((3, 3))
     polar_cov[:2, :2] = sighting.noise

@@ -8,15 +8,13 @@ observability.py   factors that leave directions open, and messages about them
 """
 
 # fmt: off
-from sonar_graph.slam.smoother.batch_solution import solve, solve_in_sight
-from sonar_graph.slam.smoother.batch_solution import JointCovariance, Marginals
-from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, Sightline
+from sonar_graph.slam.smoother.batch_solution import JointCovariance, Marginals, solve
+from sonar_graph.slam.smoother.factor_store import FactorGroup, Factors, Known, Sightline, sighted_from
 from sonar_graph.slam.smoother.smoother import (
-    BoundedHistory, Changed, Estimates, HistoryParams, Smoother, SmootherParams, WholeHistory,
+    BoundedHistory, Changed, HistoryParams, Smoother, SmootherParams, WholeHistory,
 )
-from sonar_graph.slam.smoother.factor_store import Known
 
 __all__ = [
-    "BoundedHistory", "Changed", "Estimates", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Known",
-    "Marginals", "Sightline", "Smoother", "SmootherParams", "WholeHistory", "solve", "solve_in_sight",
+    "BoundedHistory", "Changed", "FactorGroup", "Factors", "HistoryParams", "JointCovariance", "Known",
+    "Marginals", "Sightline", "Smoother", "SmootherParams", "WholeHistory", "sighted_from", "solve",
 ]

@@ -23,6 +23,7 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.slam.smoother.factor_store import (
     Known,
     Sightlines,
+    factors_in,
     missed,
     picked,
     sighted_from,
@@ -56,7 +57,7 @@ class StackedGraph:
     """A graph whose factors in Python are evaluated together, where their class has a `Stack`."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        self.factors = [graph.at(i) for i in range(graph.size())]
+        self.factors = factors_in(graph)
         self._rest = gtsam.NonlinearFactorGraph()
         kinds: dict[type[Stack], list[gtsam.NonlinearFactor]] = defaultdict(list)
         for factor in self.factors:
@@ -68,7 +69,7 @@ class StackedGraph:
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squared errors."""
-        return float(self._rest.error(values)) + sum(
+        return self._rest.error(values) + sum(
             stack.error(values) for stack in self._stacks
         )
 
@@ -80,11 +81,6 @@ class StackedGraph:
         ):
             linear.push_back(factor)
         return linear
-
-
-def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
-    """Solution by Levenberg-Marquardt; the initial values where no step lowers the error."""
-    return descended(graph, initial, MAX_STEPS).values
 
 
 class Descent(NamedTuple):
@@ -208,12 +204,13 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
     params.setFactorization("QR")
     tree = gtsam.ISAM2(params)
     held = gtsam.NonlinearFactorGraph()
-    for i in range(linear.size()):
-        held.push_back(gtsam.LinearContainerFactor(linear.at(i), values))
+    for factor in factors_in(linear):
+        held.push_back(gtsam.LinearContainerFactor(factor, values))
     tree.update(held, picked(values, linear.keyVector()))
     return tree
 
 
+NO_SIGHTLINES: Sightlines = {}
 OUTVOTED = 5.0
 """A landmark is misplaced where the median sighting misses it by more than this number of scatters. The scatter is the
 median distance of the sighted points from their median."""
@@ -229,7 +226,7 @@ def misplaced(values: Known, sightlines: Sightlines) -> list[int]:
     found = []
     for key, lines in sightlines.items():
         sighted = sighted_from(values, lines)
-        behind, miss_m = missed(sighted, np.asarray(values.atPoint3(key)))
+        behind, miss_m = missed(sighted, values.atPoint3(key))
         if 2 * behind >= len(lines):
             found.append(key)
         elif len(lines) > 2:
@@ -253,11 +250,14 @@ def placed_again(
     return placed
 
 
-def solve_in_sight(
-    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines
+def solve(
+    graph: gtsam.NonlinearFactorGraph,
+    initial: gtsam.Values,
+    sightlines: Sightlines = NO_SIGHTLINES,
 ) -> gtsam.Values:
     """Solve a graph; solve it again while landmarks are misplaced and new starts for them lower the error.
 
+    Without sightlines, and where no step lowers the error, once; the initial values may be the solution.
     The repeated descents may try `MAX_STEPS` together, so that a graph whose measurements contradict each other, where
     landmarks stay misplaced, costs at most twice as much as one descent.
     """
@@ -359,9 +359,7 @@ class Marginals:
 
     def marginalCovariance(self, key: int) -> Floats:
         """Covariance of one variable; the name is GTSAM's."""
-        return np.asarray(
-            self._ask(lambda marginals: marginals.marginalCovariance(key))
-        )
+        return self._ask(lambda marginals: marginals.marginalCovariance(key))
 
     def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:
         """Joint covariance of some; the name is GTSAM's."""

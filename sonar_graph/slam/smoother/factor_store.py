@@ -8,7 +8,7 @@ factors, or bias where they have none; marginals contain its information then.
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -50,7 +50,9 @@ def kind(key: int) -> int:
 
 def tangent_size(key: int) -> int:
     """Dimension of a variable: 6 for a pose, 11 for the biases, 3 for a point."""
-    return TANGENT_SIZES[kind(key)]
+    return TANGENT_SIZES[
+        key >> 56
+    ]  # `kind`, without a call for each variable of each covariance
 
 
 def is_pose(key: int) -> bool:
@@ -113,6 +115,11 @@ class SonarViews(NamedTuple):
         beam += np.sin(azimuth_rad) * self.R[:, :, 1]
         return self.t + range_m * beam
 
+    def in_sonar(self, points: Floats) -> Floats:
+        """Points of the world, shape (k, 3), in the axes of each sonar, shape (n, k, 3)."""
+        from_sonar = points - self.t[:, None]
+        return np.einsum("nji,nkj->nki", self.R, from_sonar)  # R^T (p - t)
+
 
 def sighted_from(values: Known, lines: Sequence[Sightline]) -> SonarViews:
     """Sightings from where keyframes are estimated."""
@@ -132,7 +139,7 @@ def missed(sighted: SonarViews, landmark: Floats) -> tuple[int, Floats]:
     Behind is a right angle or more off the measured azimuth.
     """
     range_m, azimuth_rad = sighted.z.T
-    q = np.einsum("nba,nb->na", sighted.R, landmark - sighted.t)  # in sonar axes
+    q = sighted.in_sonar(landmark[None])[:, 0]  # (n, 3)
     off_rad = wrap_angle(np.arctan2(q[:, 1], q[:, 0]) - azimuth_rad)
     off_m = np.sqrt(np.vecdot(q, q)) - range_m
     ahead_m = q[:, 0] * np.cos(azimuth_rad) + q[:, 1] * np.sin(azimuth_rad)
@@ -249,10 +256,6 @@ class FactorStore:
         self.gone = set()
         self._new_graph = None
 
-    def factors(self, handles: Iterable[int]) -> list[gtsam.NonlinearFactor]:
-        """Factors of some groups."""
-        return [factor for handle in handles for factor in self.groups[handle]]
-
     def graph(self, left_out: Container[int] = ()) -> gtsam.NonlinearFactorGraph:
         """All factors but those of some handles."""
         return graph_of(
@@ -279,6 +282,11 @@ class FactorStore:
     def newly_seen(self) -> set[int]:
         """Landmarks whose sightings the window has not taken up yet."""
         return {group.seen[0] for group in self.new.values() if group.seen is not None}
+
+
+def factors_in(graph: Any) -> list[Any]:
+    """Factors of a graph in which none is missing."""
+    return [graph.at(i) for i in range(graph.size())]
 
 
 def graph_of(groups: Iterable[FactorGroup]) -> gtsam.NonlinearFactorGraph:

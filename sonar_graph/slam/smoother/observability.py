@@ -18,7 +18,14 @@ import numpy as np
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.smoother.factor_store import (
+    BIAS,
+    LANDMARK,
+    POSE,
     FactorStore,
+    factors_in,
+    is_landmark,
+    is_pose,
+    kind,
     tangent_size,
     variable_name,
 )
@@ -32,14 +39,14 @@ RANK_LIMIT = 1e-9
 OPEN_SHARE = 1e-3
 """Share of a unit vector v from which on a variable takes part in it."""
 AXES = {
-    "x": ("roll", "pitch", "yaw", "forward", "left", "up"),
-    "l": ("x", "y", "z"),
-    "b": ("about x", "about y", "about z"),
+    POSE: ("roll", "pitch", "yaw", "forward", "left", "up"),
+    LANDMARK: ("x", "y", "z"),
+    BIAS: ("about x", "about y", "about z"),
 }
 MISSING = {
-    "l": "an elevation, a floor prior or a view from elsewhere is missing",
-    "b": "a prior or a walk from another bias is missing",
-    "x": "odometry from another keyframe or a prior is missing",
+    LANDMARK: "an elevation, a floor prior or a view from elsewhere is missing",
+    BIAS: "a prior or a walk from another bias is missing",
+    POSE: "odometry from another keyframe or a prior is missing",
 }
 SPOILT = "gives an error that is no number"
 
@@ -54,7 +61,8 @@ class Open:
 
     def axes(self) -> str:
         """Name of the axis nearest to each direction, with its components where it is not the axis itself."""
-        names, found = AXES[chr(gtsam.symbolChr(self.key))], []
+        names = AXES[kind(self.key)]
+        found = []
         for direction in self.directions:
             nearest = int(np.argmax(np.abs(direction)))
             shares = f"mostly {names[nearest]} ({', '.join(f'{share:.2f}' for share in direction)})"
@@ -81,7 +89,7 @@ def left_open(
         return []
     factors = [
         factor
-        for factor in map(graph.at, range(graph.size()))
+        for factor in factors_in(graph)
         if not places.keys().isdisjoint(factor.keys())
     ]
     A = np.vstack(
@@ -104,7 +112,7 @@ def left_open(
     for key, place in places.items() if len(null) else ():
         _, s, V = np.linalg.svd(null[:, place], full_matrices=False)
         if (s > OPEN_SHARE).any():
-            found.append(Open(key, np.asarray(V[s > OPEN_SHARE])))
+            found.append(Open(key, V[s > OPEN_SHARE]))
     return found
 
 
@@ -184,7 +192,7 @@ class Blame:
         return [
             self._without(open_)
             for key in self._new_keys
-            if gtsam.symbolChr(key) != ord("x")
+            if not is_pose(key)
             for open_ in left_open(self.graph, values, [key], least_said)
         ]
 
@@ -195,20 +203,15 @@ class Blame:
 
         Raises an `EstimatorError` where a keyframe, or what was in the window before, is left open.
         """
-        graph, inside = (
-            gtsam.NonlinearFactorGraph(window),
-            {*window.keyVector(), *self._new_keys},
-        )
-        for factor in map(self.graph.at, range(self.graph.size())):
+        graph = gtsam.NonlinearFactorGraph(window)
+        inside = {*window.keyVector(), *self._new_keys}
+        for factor in factors_in(self.graph):
             # a new factor may be on a variable that has left the window
             if inside.issuperset(factor.keys()):
                 graph.add(factor)
         found: list[Withheld] = []
         for open_ in left_open(graph, values, sorted(inside)):
-            if (
-                gtsam.symbolChr(open_.key) == ord("x")
-                or open_.key not in self._new_keys
-            ):
+            if is_pose(open_.key) or open_.key not in self._new_keys:
                 raise EstimatorError(
                     f"isam2: {self._explained(open_, self._labelled(graph, open_.key))}"
                 )
@@ -238,31 +241,26 @@ class Blame:
         labels = {
             f: label for group in self._store for label, f in group.factors.items()
         }
-        factors = [graph.at(i) for i in range(graph.size())]
         return [
             (labels.get(f, MARGINAL), f)
-            for f in factors
+            for f in factors_in(graph)
             if key is None or key in list(f.keys())
         ]
 
     def _without(self, open_: Open) -> Withheld:
-        on_it = {
-            handle: [
-                (label, f)
-                for label, f in group.factors.items()
-                if open_.key in list(f.keys())
-            ]
-            for handle, group in self._store.new.items()
-        }
-        factors = [labelled for group in on_it.values() for labelled in group]
-        handles = {handle for handle, group in on_it.items() if group}
-        return Withheld(
-            handles, {open_.key}, f"{self._explained(open_, factors)}; withheld"
-        )
+        handles = set()
+        factors = []
+        for handle, group in self._store.new.items():
+            for label, factor in group.factors.items():
+                if open_.key in list(factor.keys()):
+                    handles.add(handle)
+                    factors.append((label, factor))
+        message = f"{self._explained(open_, factors)}; withheld"
+        return Withheld(handles, {open_.key}, message)
 
     def _explained(self, open_: Open, factors: list[Labelled]) -> str:
         """Variable, its factors, the open directions, and what would close them, in words."""
-        missing = MISSING[chr(gtsam.symbolChr(open_.key))]
+        missing = MISSING[kind(open_.key)]
         return f"{self._told(factors, open_.key)}; open: {open_.axes()}; {missing}"
 
     def _told(self, factors: list[Labelled], key: int | None = None) -> str:
@@ -272,26 +270,17 @@ class Blame:
         """
         keys = [list(factor.keys()) for _, factor in factors]
         if key is None:
-            key = max(keys[0], key=lambda k: gtsam.symbolChr(k) == ord("l"))
-        is_pose = gtsam.symbolChr(key) == ord("x")
-        keyframes = (
-            [key]
-            if is_pose
-            else sorted(
-                {k for ks in keys for k in ks if gtsam.symbolChr(k) == ord("x")}
-            )
-        )
+            key = max(keys[0], key=is_landmark)
+        # a keyframe stands for itself
+        others = {k for ks in keys for k in ks if is_pose(k)}
+        keyframes = [key] if is_pose(key) else sorted(others)
         at = ", ".join(
             f"{variable_name(k)} at {self._times_s[k]:.3f} s"
             for k in keyframes
             if k in self._times_s
         )
-        name = (
-            at
-            if is_pose and at
-            else f"{variable_name(key)}, from {at}"
-            if at
-            else variable_name(key)
-        )
+        name = variable_name(key)
+        if at:
+            name = at if is_pose(key) else f"{name}, from {at}"
         counts = Counter(label for label, _ in factors)
         return f"{name}: {', '.join(f'{count} {label}' for label, count in counts.items()) or 'no factor'}"

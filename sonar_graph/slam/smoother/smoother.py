@@ -28,12 +28,13 @@ from sonar_graph.slam.smoother.batch_solution import (
     KeptCovariance,
     Marginals,
     misplaced,
-    solve_in_sight,
+    solve,
 )
 from sonar_graph.slam.smoother.factor_store import (
     FactorGroup,
     Factors,
     FactorStore,
+    factors_in,
     is_pose,
     picked,
     variable_name,
@@ -290,7 +291,7 @@ class Smoother:
         if not self.is_bounded:
             return self._store.graph()
         graph = gtsam.NonlinearFactorGraph()
-        for factor in (self._taken_up.at(i) for i in range(self._taken_up.size())):
+        for factor in factors_in(self._taken_up):
             # removed by an exchange, which the window has not made yet
             if factor not in self._store.gone:
                 graph.add(factor)
@@ -361,7 +362,7 @@ class Smoother:
         self._solved = None
         if group.seen is not None:
             # stands for the range of the sonar, which the calibration does not contain
-            range_m = float(group.seen[1].z[0])
+            range_m = group.seen[1].z[0]
             self._longest_range_m = max(self._longest_range_m, range_m)
         return self._store.add(group)
 
@@ -471,17 +472,15 @@ class Smoother:
         # marginals of a bounded window stay linearised where their poses left
         if isinstance(self._window, FixedLagWindow):
             may_restart = time_s >= self._restarted_s + self.params.lag_s
-            if (
-                may_restart
-                and self._window.largest_shift(self._landmarks)
-                > self.params.stale_shift_m
-            ):
+            shift_m = self._largest_shift(self._landmarks)
+            if may_restart and shift_m > self.params.stale_shift_m:
                 self._restart(time_s)
 
     def _iterate(self, time_s: float, least: float) -> None:
         """Further Gauss-Newton steps while the last one was large (rad or m); a restart where they diverge."""
         for _ in range(MOST_STEPS):
-            step = self._largest_step()
+            newest = [] if self._newest_pose is None else [self._newest_pose]
+            step = self._largest_shift([*self._landmarks, *newest])
             # not <= : also where the step is no number
             if not step <= LEAST_SUSPICIOUS and self._has_diverged():
                 self._restart(time_s)
@@ -535,12 +534,9 @@ class Smoother:
 
     # ---------------------------------------------------------------- divergence
 
-    def _largest_step(self) -> float:
-        """Largest component (rad or m) by which a landmark or the newest keyframe left its linearisation point."""
-        keys = list(self._landmarks)
-        if self._newest_pose is not None:
-            keys.append(self._newest_pose)
-        return self._window.largest_shift(keys)
+    def _largest_shift(self, keys: Sequence[int]) -> float:
+        """Largest component by which some variables have moved from their linearisation point, rad or m."""
+        return np.abs(self._window.delta().vector(keys)).max() if keys else 0.0
 
     def _has_diverged(self) -> bool:
         """True when the estimate has a larger error than the linearisation point, from which the step started."""
@@ -567,7 +563,7 @@ class Smoother:
     def _restart(self, time_s: float) -> None:
         """Begin the window again at the batch solution of the graph."""
         graph = self.graph
-        values = solve_in_sight(graph, self._before_update(), self._store.sightlines())
+        values = solve(graph, self._before_update(), self._store.sightlines())
         self._restarted_s = time_s
         self._begin(graph, values, time_s)
 
@@ -748,8 +744,6 @@ class Smoother:
         """
         if self._solved is None:
             graph = self.graph
-            values = solve_in_sight(
-                graph, self.estimates.all(), self._store.sightlines()
-            )
+            values = solve(graph, self.estimates.all(), self._store.sightlines())
             self._solved = values, Marginals(graph, values)
         return self._solved

@@ -21,6 +21,7 @@ from sonar_graph.slam.smoother.factor_store import (
     LANDMARK,
     TANGENT_SIZES,
     FactorGroup,
+    factors_in,
     graph_of,
     picked,
 )
@@ -85,8 +86,7 @@ class BundleError:
         self._order = gtsam.Ordering()
         for key in view:
             self._order.push_back(key)
-        factors = [self._graph.at(i) for i in range(self._graph.size())]
-        self.rows = sum([factor.dim() for factor in factors])
+        self.rows = sum([factor.dim() for factor in factors_in(self._graph)])
 
     def __call__(
         self,
@@ -220,12 +220,9 @@ class WholeWindow:
         """True for a variable in the window."""
         return self.isam.valueExists(key)
 
-    def largest_shift(self, keys: Sequence[int]) -> float:
-        """Largest component by which some variables have moved from their linearisation point, rad or m."""
-        if not keys:
-            return 0.0
-        # GTSAM returns a reference, not a copy
-        return float(np.abs(self.isam.getDelta().vector(keys)).max())
+    def delta(self) -> gtsam.VectorValues:
+        """Distance of each variable from its linearisation point; a reference, not a copy."""
+        return self.isam.getDelta()
 
     def estimate(self, keys: Sequence[int] | None = None) -> gtsam.Values:
         """Estimate of some variables, or of all."""
@@ -274,7 +271,7 @@ class FixedLagWindow:
         inside = gtsam.NonlinearFactorGraph()
         outside = gtsam.NonlinearFactorGraph()
         slot_of: dict[gtsam.NonlinearFactor, int] = {}
-        for factor in (graph.at(i) for i in range(graph.size())):
+        for factor in factors_in(graph):
             is_inside = all(key in times_s for key in list(factor.keys()))
             if is_inside:
                 slot_of[factor] = inside.size()
@@ -351,11 +348,9 @@ class FixedLagWindow:
                 graph.add(factor)
         return graph
 
-    def largest_shift(self, keys: Sequence[int]) -> float:
-        """Largest component by which some variables have moved from their linearisation point, rad or m."""
-        if not keys:
-            return 0.0
-        return float(np.abs(self._fixed_lag.getDelta().vector(keys)).max())
+    def delta(self) -> gtsam.VectorValues:
+        """Distance of each variable from its linearisation point."""
+        return self._fixed_lag.getDelta()
 
 
 def marginal(
@@ -376,6 +371,4 @@ def marginal(
         if is_by_qr
         else linear.marginal(separator)
     )
-    return [
-        gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())
-    ]
+    return [gtsam.LinearContainerFactor(each, values) for each in factors_in(found)]
