@@ -40,6 +40,7 @@ from baselines.kalman import (
     GATED,
     NEW,
     Judged,
+    covariance_after,
     distance,
     judged_far,
     polar_covariance,
@@ -289,9 +290,7 @@ class FilterShell(ABC):
     def pose_after(self, motion: Motion) -> tuple[Floats, Floats, Floats]:
         """world_R_body (3, 3), position (3,), and covariance of [theta, rho] (6, 6) a motion after the state."""
         R, X, J = self.linearised(motion)
-        k = J.shape[1]
-        A = J @ self.covariance()[:k, :k] @ J.T + motion.C
-        return R, X, 0.5 * (A + A.T)
+        return R, X, covariance_after(self.covariance(), J, motion.C)
 
     def augment(self, motion: Motion, z: Floats, R_z: Floats) -> int:
         """Append a landmark ``p = g(x_v, z, elevation)``, seen a motion after the state; its number in the state.

@@ -95,6 +95,14 @@ def symmetric(A: Floats) -> Floats:
     return 0.5 * (A + A.T)
 
 
+@compiled
+def covariance_after(P: Floats, J: Floats, C: Floats) -> Floats:
+    """``J P J^T + C``, with the block of P that J is by; symmetric to the last bit."""
+    k = J.shape[1]
+    _, S = innovation_of(P[:k, :k], J, C)
+    return S
+
+
 @inlined
 def view_noise(sight: Sight, motion: Motion, R_z: Floats) -> Floats:
     """``R_z + H_b C H_b^T``, shape (2, 2): noise of a view, with that of the motion to it."""
@@ -141,7 +149,7 @@ def judged(
     return USED, widened
 
 
-@compilable
+@inlined
 def correction_by_view(
     P: Floats,
     H: Floats,

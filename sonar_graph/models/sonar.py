@@ -76,14 +76,17 @@ def polar_measurements(
     detections: LandmarkDetections, sonar: SonarCalibration
 ) -> tuple[Floats, Floats]:
     """Range (m) and azimuth (rad), shape (m, 2), and their covariances, (m, 2, 2): the calibration's without others."""
-    z = np.column_stack((detections.range_m, detections.azimuth_rad))
+    z = np.empty((len(detections), 2))
+    z[:, 0] = detections.range_m
+    z[:, 1] = detections.azimuth_rad
     given = detections.range_azimuth_cov
     # a covariance off symmetry by rounding is made symmetric
     noise = 0.5 * (given + given.transpose(0, 2, 1))
-    is_unknown = np.isnan(noise)
-    if is_unknown.any():
-        sigmas = (sonar.range_sigma_m, sonar.azimuth_sigma_rad)
-        noise[is_unknown.any(axis=(1, 2))] = np.diag(np.square(sigmas))
+    if math.isnan(noise.sum()):
+        is_unknown = np.isnan(noise).any(axis=(1, 2))
+        noise[is_unknown] = np.diag(
+            [sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]
+        )
     return z, noise
 
 

@@ -25,7 +25,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.models import Mount, polar_difference, sight_of
+from sonar_graph.models import Mount, sight_of, wrap_angle
 from sonar_graph.motion import PreintegratedMotion
 from sonar_graph.numerics import (
     LOWER_LEFT,
@@ -299,12 +299,38 @@ def with_sources(covariance: JointCovariance, sources: list[Source]) -> Floats:
 
 def weigh(z: Floats, expected: Floats, joint: Floats, cov: Floats) -> Compared:
     """Compare m detections and their noise with the expectation and its joint covariance, shape (2 m, 2 m)."""
-    S_0 = diagonal_blocks(joint, 2)
-    innovation = polar_difference(z, expected)
-    S = S_0 + cov
-    weighed = np.linalg.solve(S, innovation[..., None])[..., 0]
-    ratios = np.diagonal(S_0, axis1=1, axis2=2) / np.diagonal(cov, axis1=1, axis2=2)
-    return Compared(innovation, S, np.vecdot(innovation, weighed), ratios.max(axis=1))
+    m = len(z)
+    found = Compared(np.empty((m, 2)), np.empty((m, 2, 2)), np.empty(m), np.empty(m))
+    write_compared(z, expected, joint, cov, (*found,))
+    return found
+
+
+@compiled
+def write_compared(
+    z: Floats,
+    expected: Floats,
+    joint: Floats,
+    cov: Floats,
+    found: tuple[Floats, Floats, Floats, Floats],
+) -> None:
+    """Fill the columns of `Compared`."""
+    innovation, S, distance, gain = found
+    for k in range(len(z)):
+        r = z[k, 0] - expected[k, 0]
+        alpha = wrap_angle(z[k, 1] - expected[k, 1])
+        innovation[k, 0] = r
+        innovation[k, 1] = alpha
+        for i in range(2):
+            for j in range(2):
+                S[k, i, j] = joint[2 * k + i, 2 * k + j] + cov[k, i, j]
+        a = S[k, 0, 0]
+        b = S[k, 0, 1]
+        c = S[k, 1, 1]
+        # e' S^-1 e with the closed inverse of a 2 x 2 matrix
+        squares = c * r**2 - 2.0 * b * r * alpha + a * alpha**2
+        distance[k] = squares / (a * c - b**2)
+        of_range = joint[2 * k, 2 * k] / cov[k, 0, 0]
+        gain[k] = max(of_range, joint[2 * k + 1, 2 * k + 1] / cov[k, 1, 1])
 
 
 @inlined

@@ -60,6 +60,7 @@ class GateResult(NamedTuple):
     """Squared Mahalanobis distance of each row from the last one accepted, shape (n,)."""
     is_outlier: Flags
     """Shape (n,)."""
+    has_outliers: bool
 
 
 def gate_velocities(
@@ -73,8 +74,8 @@ def gate_velocities(
     n = len(rows.stamps_ns)
     distance = np.zeros(n)
     is_outlier = np.zeros(n, np.bool_)
-    _write_gated(rows, known, walk, gate, distance, is_outlier)
-    return GateResult(distance, is_outlier)
+    has_outliers = _write_gated(rows, known, walk, gate, distance, is_outlier)
+    return GateResult(distance, is_outlier, has_outliers)
 
 
 @compiled
@@ -85,8 +86,9 @@ def _write_gated(
     gate: float,
     distance: Floats,
     is_outlier: Flags,
-) -> None:
-    """Fill the columns of `GateResult`."""
+) -> bool:
+    """Fill the columns of `GateResult`; returns ``has_outliers``."""
+    has_outliers = False
     last_ns = LATEST_NS
     u = ZERO
     Q_u = O3
@@ -104,10 +106,13 @@ def _write_gated(
                 u, Q_u, v, Q_v, (stamp_ns - last_ns) * 1e-9, walk
             )
         is_outlier[k] = distance[k] > gate
-        if not is_outlier[k]:
+        if is_outlier[k]:
+            has_outliers = True
+        else:
             last_ns = stamp_ns
             u = v
             Q_u = Q_v
+    return has_outliers
 
 
 @inlined

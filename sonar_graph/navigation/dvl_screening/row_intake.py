@@ -138,7 +138,9 @@ class RowIntake:
         result = self._gated(rows)
         if confirmation is None:
             return self._place(rows, result)
-        accepted_ns = rows.stamps_ns[~result.is_outlier]
+        accepted_ns = rows.stamps_ns
+        if result.has_outliers:
+            accepted_ns = rows.stamps_ns[~result.is_outlier]
         if confirmation.lets_all_pass(rows.stamps_ns, accepted_ns):
             confirmation.accept(accepted_ns)
             return self._place(rows, result)
@@ -209,8 +211,8 @@ class RowIntake:
         self, rows: VelocityRows, result: GateResult, confirmed_ns: int = EARLIEST_NS
     ) -> bool:
         """Place rows that are no outliers; True as for `add_imu`."""
-        outlier = result.is_outlier
-        if outlier.any():
+        if result.has_outliers:
+            outlier = result.is_outlier
             outlier_ns = rows.stamps_ns[outlier].tolist()
             distances = result.distance[outlier].tolist()
             for stamp_ns, distance in zip(outlier_ns, distances, strict=True):
