@@ -43,7 +43,7 @@ from pydantic import (
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation import SCORES
-from sonar_graph.files import text_of
+from sonar_graph.files import parsed_toml, text_of
 from sonar_graph.settings import choice, faults_in, flattened
 
 # names of tables and keys, and indices of the entries of arrays, from the top of the file
@@ -256,11 +256,9 @@ def read_suite(path: Path) -> SuiteFile:
     """
     try:
         text = text_of(path)
-        values = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise BatchError(f"{path}: cannot be read: {error}") from error
-    except (ValueError, RecursionError) as error:
-        raise BatchError(f"{path}: not TOML: {error}") from error
+    values = parsed_toml(text, path, BatchError)
     try:
         suite = Suite.model_validate(values)
     except ValidationError as error:

@@ -1,7 +1,7 @@
 """Files and processes: inputs, atomic writing, folders of results, Ctrl-C, and processes for others' code."""
 
 # fmt: off
-from sonar_graph.files.inputs import as_path, read_json, regular, spelt, strict_json, text_of
+from sonar_graph.files.inputs import as_path, parsed_toml, read_json, read_toml, regular, spelt, strict_json, text_of
 from sonar_graph.files.interrupts import (
     INTERRUPTED, deferred_interrupt, end_at_once, interrupt_event, loading, noticed_interrupts,
     terminations_as_interrupts,
@@ -15,7 +15,7 @@ from sonar_graph.files.result_folder import (
 __all__ = [
     "BATCH", "COMPARISON", "INTERRUPTED", "KilledError", "LOCK", "MANIFEST", "Manifest", "OwnProcess", "PAPER",
     "READY", "Tell", "as_path", "deferred_interrupt", "digest_of", "end_at_once", "interrupt_event", "loading",
-    "noticed_interrupts", "others_in", "read_json", "regular", "remove_written", "replacing", "result_folder",
-    "result_written", "serve", "spelt", "strict_json", "terminations_as_interrupts", "text_of", "write_json",
-    "written_whole",
+    "noticed_interrupts", "others_in", "parsed_toml", "read_json", "read_toml", "regular", "remove_written",
+    "replacing", "result_folder", "result_written", "serve", "spelt", "strict_json", "terminations_as_interrupts",
+    "text_of", "write_json", "written_whole",
 ]

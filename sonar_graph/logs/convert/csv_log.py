@@ -24,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
-from sonar_graph.files import as_path, spelt
+from sonar_graph.files import as_path, read_toml, spelt
 from sonar_graph.logs.adapters import (
     ADAPTERS,
     Adapter,
@@ -33,7 +33,6 @@ from sonar_graph.logs.adapters import (
     LandmarkRowsAdapter,
     did_you_mean,
     plain_lines,
-    read_toml,
 )
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.convert.csv_evidence import marked_valid, time_units
@@ -192,7 +191,7 @@ def read_csv(
     values = config
     if not isinstance(values, Mapping):
         source = str(config)
-        values = read_toml(as_path(config, "read_csv(tables, config)"))
+        values = read_toml(as_path(config, "read_csv(tables, config)"), LogError)
         name = name or spelt(Path(source).stem)
     roles = parse_csv_config(values, source)
     found = {role: _table(one, files, source) for role, one in roles.items()}
