@@ -62,6 +62,10 @@ def read_map(path: Path) -> ReadMap:
     >>> read_map(Path("survey.csv")).map.ids
     (4,)
     """
+    if path.is_dir():
+        inside = sorted(path.rglob("map.toml"))
+        such = f", such as {inside[0]}" if inside else ""
+        raise LogError(f"{path}: expected a map as a file, not a folder{such}")
     try:
         text = text_of(path, "utf-8-sig")  # tables of spreadsheets begin with a mark
     except OSError as error:

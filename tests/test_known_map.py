@@ -1310,6 +1310,14 @@ def test_an_identity_that_is_no_whole_number_is_refused(tmp_path, wrong):
         read_map(path)
 
 
+def test_a_folder_of_results_is_refused_with_the_map_in_it(tmp_path):
+    inside = tmp_path / "runs" / "isam2"
+    inside.mkdir(parents=True)
+    write_map(inside / "map.toml", KnownMap.of([1], np.zeros((1, 3)), sigma_m=0.1))
+    with pytest.raises(LogError, match=r"not a folder, such as .*isam2.map\.toml$"):
+        read_map(tmp_path)
+
+
 def test_a_table_of_a_spreadsheet_with_its_mark_is_read(tmp_path):
     path = tmp_path / "map.csv"
     path.write_text(HEAD + "1,0,2,3,0.1\n", encoding="utf-8-sig")
