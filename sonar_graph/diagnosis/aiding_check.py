@@ -48,7 +48,7 @@ from sonar_graph.diagnosis.findings import (
     unknown,
     unused,
 )
-from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
+from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
@@ -177,12 +177,15 @@ def match_rows(
     y: Values,
     reference: Callable[[Floats], Values],
     drift_sigma: float = 0.0,
-    longest_s: float = STRETCH_S,
+    slow_sigma: float = 0.0,
 ) -> Match:
     """Rows of a sensor compared with the motion; also in one piece, for the search of causes."""
-    found = match(motion.stretches(seconds, y, reference, longest_s), drift_sigma)
+    stretches = [
+        replace(part, slow_sigma=slow_sigma)
+        for part in motion.stretches(seconds, y, reference)
+    ]
     whole = motion.stretches(seconds, y, reference, np.inf)
-    return replace(found, whole=tuple(whole))
+    return replace(match(stretches, drift_sigma), whole=tuple(whole))
 
 
 def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -195,13 +198,19 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     # the noise of velocities adds up to a walk of the height, which grows with the time compared
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
-    found = match_rows(motion, t, depth.z_m, motion.reference(height), 0.03, longest_s)
+    reference = motion.reference(height)
     ahead = motion.reference(motion.ahead_m)
     stretches = [
-        replace(part, beside=lambda t: ahead(t)[:, None]) for part in found.stretches
+        replace(
+            part,
+            slow_sigma=climb_sigma(sequence),
+            beside=lambda t: ahead(t)[:, None],
+        )
+        for part in motion.stretches(t, depth.z_m, reference, longest_s)
     ]
-    found = replace(found, stretches=tuple(stretches))
-    return found.less_certain(motion.sampling_error(motion.height_m))
+    whole = motion.stretches(t, depth.z_m, reference, np.inf)
+    found = replace(match(stretches, 0.03), whole=tuple(whole))
+    return motion.between_rows(found, motion.height_m)
 
 
 def climb_sigma(sequence: Sequence) -> float:
@@ -234,7 +243,13 @@ def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
         return None
     t = motion.since_origin(heading.stamps_ns)
     yaw_rad = unwrapped(heading.yaw_rad)
-    return match_rows(motion, t, yaw_rad, motion.turned, 0.02)
+    slow_rad = slow_heading_sigma(sequence)
+    return match_rows(motion, t, yaw_rad, motion.turned, 0.02, slow_rad)
+
+
+def slow_heading_sigma(sequence: Sequence) -> float:
+    """Error of a compass that changes as slowly as the vehicle turns, rad."""
+    return 0.1 * sequence.calibration.heading.bias_sigma_rad
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -247,8 +262,14 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = match_rows(motion, t, level, motion.reference(path))
-    return found.less_certain(motion.sampling_error(motion.path_m))
+    slow_m = slow_fix_sigma(sequence)
+    found = match_rows(motion, t, level, motion.reference(path), slow_sigma=slow_m)
+    return motion.between_rows(found, motion.path_m)
+
+
+def slow_fix_sigma(sequence: Sequence) -> float:
+    """Error of fixes that changes as slowly as the vehicle moves, m."""
+    return 0.1 * level_sigma_m(fix_sigma_m(sequence))
 
 
 def is_level_fix(fixes: PositionFixes) -> NDArray[np.bool_]:
@@ -322,7 +343,7 @@ HEADING = Check(
     against="the gyros",
     compare=heading_match,
     sigma=lambda sequence: sequence.calibration.heading.sigma_rad,
-    slow_sigma=lambda sequence: 0.1 * sequence.calibration.heading.bias_sigma_rad,
+    slow_sigma=slow_heading_sigma,
     units=DEGREES,
     sense=lambda _, config: Advice(
         "it turns against the gyros, clockwise", other_world(config, "heading")
@@ -346,7 +367,7 @@ POSITIONS = Check(
     against="the path by gyros and Doppler log",
     compare=fix_match,
     sigma=lambda sequence: level_sigma_m(fix_sigma_m(sequence)),
-    slow_sigma=lambda sequence: 0.1 * level_sigma_m(fix_sigma_m(sequence)),
+    slow_sigma=slow_fix_sigma,
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda _, config: Advice(
         "north and east are exchanged",

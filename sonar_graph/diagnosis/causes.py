@@ -35,7 +35,7 @@ from sonar_graph.diagnosis.signals import (
 from sonar_graph.diagnosis.start import lacks_gravity, turned_mounting, without_bias
 from sonar_graph.diagnosis.turn_rate import residual
 from sonar_graph.errors import AlignmentError
-from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.measurements import NS_PER_S, Floats, Imu
 from sonar_graph.navigation.alignment import (
     Estimate1D,
     align_in_motion,
@@ -314,7 +314,11 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
     texts = list[str]()
     for whole in found.whole:
         x = turned_to(whole.y, whole.x)
-        for step in steps(whole.seconds, whole.y, x, sigma, ratio):
+        # a velocity that changes between two rows of a slow Doppler log may have changed at any time between them
+        T = found.interval_s
+        before, at, after = whole.shifted(np.array([T, 0.0, -T]))
+        doubt = np.abs(after - 2.0 * at + before)
+        for step in steps(whole.seconds, whole.y, x, sigma, ratio, doubt):
             size = np.degrees(step.size) if unit == "°" else step.size
             texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
     return " and ".join(texts[:LONGEST_LIST])
@@ -439,13 +443,29 @@ def misfit_of(sequence: Sequence, begin_ns: int, step_ns: int) -> float:
     dvl = sequence.dvl.between(begin_ns - 1, end_ns)
     if imu is None or dvl is None:
         return 0.0
+    whole = until_hole(imu)
+    # a calibration states the noise of a sensor at rest, and thrusters shake it
+    sensors = calibration.imu
+    shaken = max(sensors.accel_noise_density, vibration_density(whole))
+    sensors = sensors.model_copy(update={"accel_noise_density": shaken})
     try:
-        align_in_motion(until_hole(imu), dvl, calibration)
+        align_in_motion(whole, dvl, calibration.model_copy(update={"imu": sensors}))
     except AlignmentError as error:
         return error.misfit
     except np.linalg.LinAlgError:
         pass  # the noise of the calibration is zero
     return 0.0
+
+
+def vibration_density(imu: Imu) -> float:
+    """Noise density of the specific force by its second differences, m/s²/√Hz: motion changes little in two rows."""
+    bent = np.diff(imu.specific_force, n=2, axis=0)
+    if not len(bent):
+        return 0.0
+    # the second difference of white noise has six times its variance
+    sigma = 1.4826 * np.median(np.abs(bent), axis=0) / np.sqrt(6.0)  # (3,)
+    interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
+    return float(sigma.max() * np.sqrt(interval_s))
 
 
 def turned_to(y: Values, x: Values) -> Values:

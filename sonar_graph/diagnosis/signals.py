@@ -61,6 +61,8 @@ class SignalStretch:
     """x at times of any shape; NaN where it is not known."""
     has_offset: bool = True
     """False for changes, which have none."""
+    slow_sigma: float = 0.0
+    """Error of the reference that changes as slowly as the motion: of a sensor without noise, the residuals hide it."""
     beside: Callable[[Floats], Values] | None = None
     """What else may move the sensor, shape (n, q), by the table of checks."""
 
@@ -112,6 +114,8 @@ class Match:
     """What was compared."""
     whole: tuple[SignalStretch, ...] = ()
     """The same in one piece for each part of the log."""
+    interval_s: float = 0.0
+    """Between rows of the reference, where it is an integral that counts as even there."""
 
     def in_time(self) -> "Match":
         """The same with the sensor's delay taken off what is in one piece."""
@@ -288,6 +292,8 @@ def refined(
             continue
         c = found.p[0, 0]
         sigmas = found.sigmas()
+        moved = root_mean_square([moved_in(stretch, has_drift=drift_sigma > 0)])
+        sigmas[0] = np.hypot(sigmas[0], stretch.slow_sigma / max(moved, 1e-9))
         size = max(abs(c), 1e-12)
         gains.append((abs(c) if np.iscomplexobj(c) else float(c), sigmas[0]))
         angles.append((float(np.angle(c)), sigmas[0] / size))
@@ -378,13 +384,20 @@ class SignalStep(NamedTuple):
 
 
 def steps(
-    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float
+    seconds: Floats,
+    y: Values,
+    x: Values,
+    sigma: float,
+    ratio: float,
+    doubt: Floats | None = None,
 ) -> list[SignalStep]:
     """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
 
     The difference of the medians of `STEP_ROWS` rows of ``y - x`` on either side of an instant is beyond `STEP_SIGMAS`
     of its own typical size, and beyond `LEAST_STEP` of ``sigma``, that of a row; so is that of three times as many. A
     vehicle that stops and goes shows a wrong scale in steps: those of x must be smaller by a ``ratio``.
+
+    ``doubt``: by how much x may be wrong at each row, shape (n,); NaN counts as 0.
     """
     beyond = as_columns(y - x)
     known = np.isfinite(beyond).all(axis=1)
@@ -396,6 +409,8 @@ def steps(
     # what drifts away changes by three times as much
     size[near < wide / 2] = 0.0
     size[size < ratio * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
+    if doubt is not None:
+        size[size < np.nan_to_num(doubt[known])] = 0.0
     typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
     least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)
     found = list[SignalStep]()

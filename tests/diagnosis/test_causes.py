@@ -189,6 +189,15 @@ def test_velocities_of_another_vehicle_are_doubtful_also_after_a_rest(rest_s: fl
     assert found.quantity == "DVL against IMU: velocities and accelerometers"
 
 
+def test_a_hull_that_shakes_contradicts_no_slow_doppler_log():
+    """Thrusters make forces noisier than the sensor at rest, of which the calibration tells."""
+    rng = np.random.default_rng(0)
+    run = level_vehicle(wandering(0), np.zeros(3500), 1)
+    run = replace(run, dvl=run.dvl.rows(slice(0, None, 5)))
+    shaken = run.imu.specific_force + rng.normal(0.0, 1.0, run.imu.specific_force.shape)
+    assert unlike_pair(spoilt(run, "imu", specific_force=shaken)) is None
+
+
 @pytest.mark.parametrize("rows", [2200, 3500])
 def test_a_single_wild_velocity_contradicts_no_accelerometers(rows: int):
     """Also in a log of less than a minute."""
