@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
@@ -14,7 +14,9 @@ from sonar_graph.cli.arguments import (
     LogPath,
     ReadingOptions,
     answers,
+    argument,
     echo,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import working
@@ -39,23 +41,14 @@ MOST_TOPICS = 500
 def inspect(
     log: LogPath,
     reading: ReadingOptions,
-    toml: Annotated[
-        bool,
-        typer.Option(
-            "--toml",
-            help="Print only the log configuration to start from, for --log-config.",
-        ),
-    ] = False,
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise, map): seconds.",
-        ),
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print everything as one JSON object.")
-    ] = False,
+    toml: bool = option(
+        "Print only the log configuration to start from, for --log-config.", False
+    ),
+    quick: bool = option(
+        "Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise, map): seconds.",
+        False,
+    ),
+    as_json: bool = option("Print everything as one JSON object.", False, "--json"),
 ) -> None:
     """Show what is in a log: topics, rates, gaps, which topic would be used for what and why, which sensors disagree.
 
@@ -238,18 +231,10 @@ def print_summary(
 @with_options("salvage", "map")
 def calibration(
     reading: ReadingOptions,
-    log: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[LOG]",
-            exists=True,
-            help="MCAP log whose calibration and mountings count.",
-        ),
-    ] = None,
-    template: Annotated[
-        bool,
-        typer.Option("--template", help="Print all fields with units and defaults."),
-    ] = False,
+    log: Path | None = argument(
+        "MCAP log whose calibration and mountings count.", "[LOG]", None, exists=True
+    ),
+    template: bool = option("Print all fields with units and defaults.", False),
 ) -> None:
     """Print a calibration file to edit: all fields with units, meaning and defaults, and the values of a log."""
     from sonar_graph.calibration import Calibration

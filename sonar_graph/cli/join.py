@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from sonar_graph.cli.arguments import (
     OutputLog,
     Overwrite,
     ReadingOptions,
+    argument,
     echo,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
@@ -47,42 +47,31 @@ class Seen:
 class JoinOptions:
     """Options for the clock offset of the images, and for the log that is written."""
 
-    offset: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
-        ),
-    ] = None
-    search: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.5,
-            max=3600.0,
-            help=f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
-        ),
-    ] = None
+    offset: float | None = option(
+        "To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
+        metavar="SECONDS",
+    )
+    search: float | None = option(
+        f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
+        metavar="SECONDS",
+        min=0.5,
+        max=3600.0,
+    )
     overwrite: Overwrite = False
 
 
 @with_options("start", "end", "map")
 def join(
-    images: Annotated[
-        Path,
-        typer.Argument(
-            metavar="IMAGES",
-            exists=True,
-            dir_okay=False,
-            help="MCAP log with sonar images, as `convert` makes of a sonar's recording.",
-        ),
-    ],
-    navigation: Annotated[
-        Path,
-        typer.Argument(
-            metavar="NAV", exists=True, help="MCAP log with IMU and Doppler log."
-        ),
-    ],
+    images: Path = argument(
+        "MCAP log with sonar images, as `convert` makes of a sonar's recording.",
+        "IMAGES",
+        exists=True,
+        dir_okay=False,
+    ),
+    navigation: Path = argument(
+        "MCAP log with IMU and Doppler log.", "NAV", exists=True
+    ),
+    *,
     output: OutputLog,
     reading: ReadingOptions,
     options: JoinOptions,

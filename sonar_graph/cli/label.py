@@ -7,16 +7,16 @@ import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from sonar_graph.cli.arguments import (
+    REQUIRED,
     DesignsPath,
     LogPath,
     Overwrite,
     ReadingOptions,
     echo,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import is_json, progress_bars, writable_file
@@ -36,33 +36,24 @@ class LabelOptions:
     """Options for the frames that are shown, the page and the file of the labels."""
 
     designs: DesignsPath = None
-    period: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="Shortest time between the frames that are shown.",
-        ),
-    ] = 0.5
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free."),
-    ] = 0
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Only print the address.")
-    ] = False
+    period: float = option(
+        "Shortest time between the frames that are shown.",
+        0.5,
+        metavar="SECONDS",
+        min=0.0,
+    )
+    port: int = option("Port on 127.0.0.1; 0: any that is free.", 0, min=0, max=65535)
+    no_browser: bool = option("Only print the address.", False)
     overwrite: Overwrite = False
 
 
 @with_options("map")
 def label(
     log: LogPath,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="LABELS.json", help="File of the labels."
-        ),
-    ],
+    output: Path = option(
+        "File of the labels.", REQUIRED, "--output", "-o", metavar="LABELS.json"
+    ),
+    *,
     reading: ReadingOptions,
     options: LabelOptions,
 ) -> None:

@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from sonar_graph.cli.arguments import (
+    REQUIRED,
     DesignsPath,
     LogPath,
     OutputLog,
     Overwrite,
     ReadingOptions,
     answers,
+    argument,
     echo,
     existing_file,
     nested_settings,
+    option,
     validated,
     with_options,
 )
@@ -87,19 +90,12 @@ class RecogniserOptions:
     """Options for recognising landmarks by their designs."""
 
     designs: DesignsPath = None
-    model: Annotated[
-        Path | None,
-        existing_file(
-            "How often landmarks look like which, as calibrate measured it.",
-            "MODEL.json",
-        ),
-    ] = None
-    rule: Annotated[
-        str | None,
-        typer.Option(
-            help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's)."
-        ),
-    ] = None
+    model: Path | None = existing_file(
+        "How often landmarks look like which, as calibrate measured it.", "MODEL.json"
+    )
+    rule: str | None = option(
+        "How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's)."
+    )
 
     @property
     def is_given(self) -> bool:
@@ -160,13 +156,10 @@ class RecognitionChoices:
     recogniser: RecogniserName = "designs"
     motion: Motion = None
     settings: Settings = None
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PAGE.html",
-            help="Page to write: every track with picture, probabilities and fate.",
-        ),
-    ] = None
+    report: Path | None = option(
+        "Page to write: every track with picture, probabilities and fate.",
+        metavar="PAGE.html",
+    )
     overwrite: Overwrite = False
 
 
@@ -277,15 +270,12 @@ def recognise(
 class CalibrateOptions:
     """Options for what the model is measured by: labels, motion, designs and settings."""
 
-    labels: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="LABELS.json",
-            exists=True,
-            dir_okay=False,
-            help="Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
-        ),
-    ] = None
+    labels: list[Path] | None = option(
+        "Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
+        metavar="LABELS.json",
+        exists=True,
+        dir_okay=False,
+    )
     motion: Motion = None
     designs: DesignsPath = None
     settings: Settings = None
@@ -294,16 +284,11 @@ class CalibrateOptions:
 
 @with_options("start", "end", "map")
 def calibrate(
-    logs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="LOG...", exists=True, help="Logs with images and truth."
-        ),
-    ],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="MODEL.json", help="File to write."),
-    ],
+    logs: list[Path] = argument("Logs with images and truth.", "LOG...", exists=True),
+    output: Path = option(
+        "File to write.", REQUIRED, "--output", "-o", metavar="MODEL.json"
+    ),
+    *,
     reading: ReadingOptions,
     options: CalibrateOptions,
 ) -> None:
