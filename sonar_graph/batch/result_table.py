@@ -14,7 +14,7 @@ from pathlib import Path
 from sonar_graph.batch.recorded import RESULTS, SUITE_METADATA
 from sonar_graph.batch.store import NOT_RUN, PlannedRun, Row, Store
 from sonar_graph.batch.suite import Suite
-from sonar_graph.evaluation import LABELS
+from sonar_graph.evaluation import LABELS, format_value
 from sonar_graph.files import replacing
 
 KINDS = ("causal", "smoothed")
@@ -55,6 +55,10 @@ class Metric:
         """Factor from the stored to the shown value."""
         return math.degrees(1) if self.unit == "rad" else 1.0
 
+    def text(self, value: float) -> str:
+        """A value as people see it; words for infinity, which stands for runs without a value."""
+        return "no value" if math.isinf(value) else format_value(value * self.factor)
+
     @property
     def direction(self) -> str:
         """Words for the better values."""
@@ -79,12 +83,11 @@ class Metric:
     @property
     def protocol(self) -> str:
         """Definition in a sentence."""
-        said = (
+        each = " Separately for the causal and the smoothed estimate."
+        return (
             f"{self.label}, as compare defines it in the comparison.json of each run."
+            f"{'' if '' in self.keys else each}"
         )
-        if set(self.keys) <= {""}:
-            return said
-        return f"{said} Separately for the causal and the smoothed estimate."
 
 
 def is_timing(column: str) -> bool:
@@ -106,6 +109,8 @@ def metrics_of(keys: list[str]) -> list[Metric]:
     return list(found.values())
 
 
+# fields of a planned run that are columns
+DESCRIBED = ("key", "suite", "log", "seed", "variant", "estimator", "rate_hz")
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = (
     "variant",
@@ -148,40 +153,27 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
 
     rows: list[Row] = []
     for run in runs:
-        options = (
-            run.options
-            if run.landmarks is None
-            else run.options | {"landmarks": run.landmarks}
-        )
-        described: Row = {
-            "key": run.key,
-            "suite": run.suite,
-            "log": run.log,
-            "generator": run.kind,
-            "options": json.dumps(options, sort_keys=True),
-            "asked": json.dumps(run.asked, sort_keys=True),
-            "seed": run.seed,
-            "variant": run.variant,
-            "params": json.dumps(run.params, sort_keys=True),
-            "estimator": run.estimator,
-            "rate_hz": run.rate_hz,
-            **{
-                name: number
-                for name, number in run.versions.items()
-                if name in VERSIONS
-            },
+        landmarks = {} if run.landmarks is None else {"landmarks": run.landmarks}
+        as_json = {
+            "options": run.options | landmarks,
+            "asked": run.asked,
+            "params": run.params,
         }
-        row = store.row(run.key)
-        if row is None:
-            # a batch that ends early can be read without the code that planned it
-            row = {"status": NOT_RUN, "reason": "not done when this table was written"}
-        else:
-            # versions are those that the run itself found
-            row = {
-                "log_file": store.log_file(run.key),
-                **row,
-            }
-        rows.append(described | row)
+        described: Row = {
+            **{name: getattr(run, name) for name in DESCRIBED},
+            "generator": run.kind,
+            **{name: json.dumps(one, sort_keys=True) for name, one in as_json.items()},
+            **{name: run.versions[name] for name in VERSIONS if name in run.versions},
+            "log_file": store.log_file(run.key),
+        }
+        # a batch that ends early can be read without the code that planned it
+        not_done: Row = {
+            "status": NOT_RUN,
+            "reason": "not done when this table was written",
+            "log_file": None,
+        }
+        # versions are those that the run itself found
+        rows.append(described | (store.row(run.key) or not_done))
     # scores differ from log to log; every table has all of them in one order
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
     types = COLUMNS | {

@@ -63,22 +63,10 @@ def bench(
         with progress_bars() as show:
 
             def progress(done: int, planned: int, failed: int) -> None:
-                show(
-                    "runs",
-                    done,
-                    planned,
-                    f"{done}/{planned}{f', {failed} failed' if failed else ''}",
-                )
+                remark = f"{done}/{planned}" + (f", {failed} failed" if failed else "")
+                show("runs", done, planned, remark)
 
-            batch = run_suite(
-                suite,
-                output,
-                workers=options.workers,
-                scheduler=options.scheduler,
-                retry_failed=options.retry_failed,
-                overwrite=options.overwrite,
-                progress=progress,
-            )
+            batch = run_suite(suite, output, **vars(options), progress=progress)
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
         # the ordinary way waits for threads, also for those of workers that are gone

@@ -73,7 +73,6 @@ def inspect(
         # the converter's words about a start by convention
         summary.notes.pop("log.start", None)
     findings: list[Finding] = []
-    grave: set[str] = set()
     skipped = ""
     # images alone can still be recognised
     is_usable = not (
@@ -96,41 +95,31 @@ def inspect(
                 sequence = reading.read(log)
                 is_read = True
                 findings = check_sensors(sequence, config)
-                grave = {finding.quantity for finding in findings if finding.grave}
         # the tables above are worth printing all the same
         except SonarGraphError as error:
             skipped = f"not compared: {error}"
             is_usable = is_usable and is_read
     # for programs: the same content, without the exit code changing
     if as_json:
-        content = asdict(summary) | {
+        derived = {
             "path": str(summary.path),
             "duration_s": summary.duration_s,
-        }
-        content |= {
             "obstacles": summary.obstacles,
             "sensors": [finding.plain() for finding in findings],
+            "sensors_skipped": skipped,
         }
-        echo(strict_json(content | {"sensors_skipped": skipped}))
+        echo(strict_json(asdict(summary) | derived))
     else:
-        print_summary(summary, findings, grave, skipped)
+        print_summary(summary, findings, skipped)
     if not is_usable:
         raise typer.Exit(UNUSABLE)
-    if (
-        summary.has_images_alone
-        or summary.warnings
-        or any(finding.acts for finding in findings)
-    ):
+    is_doubted = summary.warnings or any(finding.acts for finding in findings)
+    if summary.has_images_alone or is_doubted:
         raise typer.Exit(DOUBTFUL)
 
 
-def print_summary(
-    summary: LogSummary,
-    findings: list[Finding],
-    grave: set[str],
-    skipped: str,
-) -> None:
-    """Print the tables of a log, and a line for each note, finding and warning, as which ``grave`` quantities count."""
+def print_summary(summary: LogSummary, findings: list[Finding], skipped: str) -> None:
+    """Print the tables of a log, and a line for each note, finding and warning, as which grave quantities count."""
     console = answers()
 
     def say(heading: str, text: str, style: str = "bold") -> None:
@@ -157,9 +146,8 @@ def print_summary(
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
     shown = summary.topics[:MOST_TOPICS]
     for topic in shown:
-        kind = topic.type_name + (
-            f" ({topic.encoding})" if topic.encoding != "cdr" else ""
-        )
+        is_other = topic.encoding != "cdr"
+        kind = topic.type_name + f" ({topic.encoding})" * is_other
         first_s = (topic.first_stamp_ns - origin_ns) * 1e-9
         last_s = (topic.last_stamp_ns - origin_ns) * 1e-9
         topics.add_row(
@@ -193,6 +181,7 @@ def print_summary(
             say(subject, note)
     if not skipped:
         console.print("\n[bold]sensors against each other[/] (± 95 %)")
+        grave = {finding.quantity for finding in findings if finding.grave}
         for finding in findings:
             warned = "warning: " if finding.quantity in grave else ""
             style = "bold yellow" if finding.acts else "bold"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.images import SonarFrames
     from sonar_graph.logs.mcap import Outgoing
-    from sonar_graph.recognition import ClockOffset, PlanarStep
+    from sonar_graph.recognition import PlanarStep
     from sonar_graph.sequence import Sequence
 
 TOPIC = "/sonar/image"
@@ -105,14 +105,8 @@ def join(
     is_stated = options.offset is not None and options.search is None
     around_s = options.offset or 0.0
     search_s = options.search or SEARCH_S
-    require_overlap(
-        images,
-        navigation,
-        sequence,
-        seen,
-        around_s,
-        0.0 if is_stated else search_s,
-    )
+    within_s = 0.0 if is_stated else search_s
+    require_overlap(images, navigation, sequence, seen, around_s, within_s)
     seconds, said = offset_of(seen, sequence, around_s, search_s, is_stated=is_stated)
     shift_ns = round(seconds * NS_PER_S)
     # the notes of both files are kept apart by their prefix
@@ -169,11 +163,8 @@ def look(
         for block in read_sonar_frames(
             log, topic, salvage=salvage, refused=lambda *_: None
         ):
-            seen = (
-                seen
-                if seen.range_m
-                else replace(seen, range_m=float(block.ranges_m.mean()))
-            )
+            if not seen.range_m:
+                seen = replace(seen, range_m=float(block.ranges_m.mean()))
             for frame in one_by_one(block):
                 step = motions.add(frame)
                 seen.stamps_ns.append(int(frame.stamps_ns[0]))
@@ -213,7 +204,6 @@ def offset_of(
     """Offset in seconds, and its description."""
     from sonar_graph.recognition import estimate_offset
 
-    estimate: ClockOffset | None = None
     try:
         with working("estimating the clock offset"):
             # also where the offset is stated, so that a wrong one is noticed
@@ -223,19 +213,14 @@ def offset_of(
     except LogError as error:
         if not is_stated:
             raise
-        return (
-            around_s,
-            f"{around_s:+.3f} s, as stated; {str(error).rpartition('; ')[0]}",
-        )
-    if not is_stated:
-        return estimate.seconds, f"{estimate}"
-    is_doubted = abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s
-    warning = (
-        "; Warning: they do not agree, leave --offset out to take the images' own"
-        if is_doubted
-        else ""
-    )
-    return around_s, f"{around_s:+.3f} s, as stated; by the images {estimate}{warning}"
+        found = str(error).rpartition("; ")[0]
+    else:
+        if not is_stated:
+            return estimate.seconds, f"{estimate}"
+        found = f"by the images {estimate}"
+        if abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s:
+            found += "; Warning: they do not agree, leave --offset out to take the images' own"
+    return around_s, f"{around_s:+.3f} s, as stated; {found}"
 
 
 def on_the_clock(

@@ -168,16 +168,16 @@ def live(
     write_json(output / COUNTS, {"estimator": estimator, "messages": counts})
     # landmarks may have refuted a place that was found in a map
     is_lost = not len(outcome.smoothed)
+    kept = ("causal", "smoothed", "landmarks", "withheld")
+    found: dict[str, Any] = {name: getattr(outcome, name) for name in kept}
+    if is_lost:
+        found = {"reason": "; ".join(outcome.withheld)}
     result = RunResult(
         estimator,
         params or overrides,
         "failed" if is_lost else "ok",
-        "; ".join(outcome.withheld) if is_lost else "",
-        causal=None if is_lost else outcome.causal,
-        smoothed=None if is_lost else outcome.smoothed,
-        landmarks=None if is_lost else outcome.landmarks,
+        **found,
         refused=outcome.refused,
-        withheld=[] if is_lost else outcome.withheld,
         update_s=np.array(outcome.update_s),
         finish_s=outcome.finish_s,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -59,6 +58,10 @@ SCORES = {
     "memory": {"peak_mb": "Peak memory added by the run"},
 }
 """Label of every score, by the parts of its key before and after the point."""
+SCORE_KEYS = tuple(
+    f"{block}.{name}" for block, labels in SCORES.items() for name in labels
+)
+"""Every key that a score can have, in the order of tables."""
 LABELS = {name: label for block in SCORES.values() for name, label in block.items()}
 BLOCKS = {
     "causal": "Causal: what was known at each instant",
@@ -106,15 +109,12 @@ def label(metric: str, comparison: Comparison, labels: dict[str, str] = LABELS) 
 
 
 def score_keys(comparison: Comparison) -> list[str]:
-    """All keys of scores in the order of the table: known ones as in `BLOCKS` and `LABELS`, then others by name."""
-    blocks = {name: place for place, name in enumerate(BLOCKS)}
-    metrics = {name: place for place, name in enumerate(LABELS)}
-
-    def place(key: str) -> tuple[float, float, str]:
-        block, _, metric = key.partition(".")
-        return blocks.get(block, math.inf), metrics.get(metric, math.inf), key
-
-    return sorted(set[str]().union(*comparison.scores.values()), key=place)
+    """All keys of scores in the order of the table: those of `SCORE_KEYS`, then others by name."""
+    found = set[str]().union(*comparison.scores.values())
+    return [
+        *(key for key in SCORE_KEYS if key in found),
+        *sorted(found.difference(SCORE_KEYS)),
+    ]
 
 
 def headline_metric(comparison: Comparison) -> str | None:
@@ -156,37 +156,48 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
         f"smoothed.{metric}": f"Smoothed, {world}",
     }
     headings[f"landmarks.{'se2_m' if aligned else 'raw_m'}"] = f"Map error, {world}"
-    columns = [Column("estimator", "Estimator", is_number=False)]
-    # whoever compares must see that a filter lacks what its neighbours have
-    rows = [
-        [
-            replace(
-                words(run.estimator, run=index),
-                note=AS_PUBLISHED if run.is_as_published else "",
-            )
-        ]
-        for index, run in enumerate(comparison.runs)
-    ]
-    for key, heading in (headings | COMPACT).items():
-        found = scores_of(comparison, key)
-        # a column of dashes takes the place of one with numbers
-        known = next(filter(None, found), None)
-        if known is None or len(columns) > MOST_SCORES:
-            continue
-        unit = f" ({known.shown_unit})" if known.shown_unit else ""
-        columns.append(Column(key, heading + unit))
-        for row, score in zip(rows, found, strict=True):
-            if score is None:
-                row.append(absent())
-                continue
-            verdict = "" if score.verdict == "consistent" else score.verdict
-            row.append(number(score.value, score.text(), note=verdict))
+    columns, cells = scores_across(comparison, headings | COMPACT, most=MOST_SCORES)
+    rows = []
+    for index, run in enumerate(comparison.runs):
+        # whoever compares must see that a filter lacks what its neighbours have
+        note = AS_PUBLISHED if run.is_as_published else ""
+        name = replace(words(run.estimator, run=index), note=note)
+        rows.append([name, *cells[index]])
     caption = (
         f"Position error: {label(metric, comparison, HEADLINES)}, causal. NEES 1: covariances fit."
         if metric
         else ""
     )
+    columns = [Column("estimator", "Estimator", is_number=False), *columns]
     return Table("compact", "Scores at a glance", caption, columns, rows)
+
+
+def scores_across(
+    comparison: Comparison,
+    headings: dict[str, str],
+    *,
+    most: int | None = None,
+    before_unit: str = " ",
+) -> tuple[list[Column], list[list[Cell]]]:
+    """Columns of the first scores with these headings that some run has, and below them the cells of each run.
+
+    The note of a cell is the verdict on a covariance that misfits.
+    """
+    # a column of dashes would take the place of one with numbers
+    known = {key: found for key in headings if any(found := scores_of(comparison, key))}
+    columns: list[Column] = []
+    rows: list[list[Cell]] = [[] for _ in comparison.runs]
+    for key in list(known)[:most]:
+        unit = next(filter(None, known[key])).shown_unit
+        heading = headings[key] + (f"{before_unit}({unit})" if unit else "")
+        columns.append(Column(key, heading))
+        for row, score in zip(rows, known[key], strict=True):
+            if score is None:
+                row.append(absent())
+                continue
+            verdict = "" if score.verdict == "consistent" else score.verdict
+            row.append(number(score.value, score.text(), note=verdict))
+    return columns, rows
 
 
 def run_columns(comparison: Comparison) -> list[Column]:
