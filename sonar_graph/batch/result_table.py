@@ -14,14 +14,10 @@ from pathlib import Path
 from sonar_graph.batch.recorded import RESULTS, SUITE_METADATA
 from sonar_graph.batch.store import NOT_RUN, PlannedRun, Row, Store
 from sonar_graph.batch.suite import Suite
-from sonar_graph.evaluation import LABELS, format_value
+from sonar_graph.evaluation import DIRECTIONS, SCORES, ScoreKind, format_value
 from sonar_graph.files import replacing
 
 KINDS = ("causal", "smoothed")
-UNITS = {"m": "m", "rad": "rad", "ms": "ms", "s": "s", "mb": "MB"}
-HIGHER_IS_BETTER = {"real_time_factor"}
-NO_BETTER = {"count", "used", "refused", "unnamed"}
-INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
 # times that every run has
 TIMINGS = ("wall_s", "read_s", "estimate_s", "cpu_s")
 
@@ -36,14 +32,20 @@ class Metric:
     """Column of the results by estimate, ``Causal`` or ``Smoothed``; the key is empty for a score of neither."""
 
     @property
+    def kind(self) -> ScoreKind:
+        """The score, of either estimate; a number of another table is known by its name alone."""
+        key = next(iter(self.keys.values()))
+        return SCORES.get(key, ScoreKind(self.name, self.name, rule=""))
+
+    @property
     def label(self) -> str:
         """Name for readers."""
-        return LABELS.get(self.name, self.name)
+        return self.kind.label
 
     @property
     def unit(self) -> str:
-        """Unit of the stored value."""
-        return UNITS.get(self.name.rpartition("_")[2], "")
+        """Unit of the stored value; empty for a number."""
+        return self.kind.unit.removeprefix("1")
 
     @property
     def shown_unit(self) -> str:
@@ -62,13 +64,7 @@ class Metric:
     @property
     def direction(self) -> str:
         """Words for the better values."""
-        if self.name in INSIDE:
-            return "1 is consistent"
-        if self.name in NO_BETTER:
-            return ""
-        return (
-            "higher is better" if self.name in HIGHER_IS_BETTER else "lower is better"
-        )
+        return DIRECTIONS[self.kind.better]
 
     @property
     def is_error(self) -> bool:
@@ -76,7 +72,7 @@ class Metric:
 
         Time and memory depend on the machine and its load: they are shown, and not tested.
         """
-        return self.direction == "lower is better" and not any(
+        return self.kind.better == "lower" and not any(
             map(is_timing, self.keys.values())
         )
 

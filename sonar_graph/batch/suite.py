@@ -42,7 +42,7 @@ from pydantic import (
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation import SCORE_KEYS
+from sonar_graph.evaluation import SCORES
 from sonar_graph.files import text_of
 from sonar_graph.settings import choice, faults_in, flattened
 
@@ -264,10 +264,10 @@ def read_suite(path: Path) -> SuiteFile:
         raise BatchError(f"{path}, line {line}: {faults_in(error, Suite)}") from error
     found = SuiteFile(path, text, suite)
     for number, metric in enumerate(suite.metrics):
-        if metric not in SCORE_KEYS:
+        if metric not in SCORES:
             found.refuse(
                 ("metrics", number),
-                f"there is no score {metric!r}{choice(metric, SCORE_KEYS)}",
+                f"there is no score {metric!r}{choice(metric, SCORES)}",
             )
     return found
 

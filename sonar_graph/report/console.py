@@ -7,6 +7,7 @@ from rich.text import Text
 
 from sonar_graph.evaluation import (
     RAW,
+    SCORES,
     Comparison,
     headline_metric,
     label,
@@ -115,13 +116,13 @@ def _lines_below(comparison: Comparison) -> list[str]:
     present = score_keys(comparison)
     if metric is None:
         if "landmarks.se2_m" in present:
-            lines.append(f"map: {label('se2_m', comparison)}")
+            lines.append(f"map: {label(SCORES['landmarks.se2_m'].label, comparison)}")
         why = environment["scored instants"].removeprefix("none: ")
         return [*lines, f"No position errors: {why}"]
     if metric != RAW:
-        lines.append(f"aligned: {label(metric, comparison)}")
+        lines.append(f"aligned: {label(SCORES[f'causal.{metric}'].label, comparison)}")
     if f"causal.{RAW}" in present:
-        lines.append(f"raw: {label(RAW, comparison)}")
+        lines.append(f"raw: {label(SCORES[f'causal.{RAW}'].label, comparison)}")
     lines.append(NEES_LEGEND)
     # odometry alone that contradicts the reference: no estimator is to blame
     far = [

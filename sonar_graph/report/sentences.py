@@ -173,7 +173,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
         if score.value > 0 and 1 - least.value / score.value < TOO_CLOSE
     ]
     equals = f", {' and '.join(close)} equally near" if close else ""
-    what = label(metric, comparison, HEADLINES)
+    what = label(HEADLINES[metric], comparison)
     # one estimator is not nearest to anything
     leads = f"is nearest to the truth{equals}:" if others else "is"
     opening = f"{name} {leads} {least.with_unit} off{'' if others else ' the truth'} ({what}, causal)"
