@@ -60,10 +60,6 @@ DEFAULT_METRICS = (
     "landmarks.se2_m",
     "time.update_median_ms",
 )
-# every key that a score can have
-METRICS = tuple(
-    f"{block}.{name}" for block, labels in SCORES.items() for name in labels
-)
 MOST_SEEDS = 1_000_000
 # largest integer that a column of the results can hold
 LARGEST_SEED = 2**63 - 1
@@ -111,9 +107,9 @@ class LogEntry(Section):
     @field_validator("seeds", mode="before")
     @classmethod
     def _check_seeds(cls, value: Any) -> Any:
-        seeds = (
-            value if isinstance(value, list) else [value] if value is not None else []
-        )
+        if value is None:
+            return None
+        seeds = value if isinstance(value, list) else [value]
         # a number of seeds is a number of runs, and a million is a mistake
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
@@ -266,10 +262,10 @@ def read_suite(path: Path) -> SuiteFile:
         raise BatchError(f"{path}, line {line}: {faults_in(error, Suite)}") from error
     found = SuiteFile(path, text, suite)
     for number, metric in enumerate(suite.metrics):
-        if metric not in METRICS:
+        if metric not in SCORES:
             found.refuse(
                 ("metrics", number),
-                f"there is no score {metric!r}{choice(metric, METRICS)}",
+                f"there is no score {metric!r}{choice(metric, SCORES)}",
             )
     return found
 

@@ -8,14 +8,14 @@ from sonar_graph.files.interrupts import (
 )
 from sonar_graph.files.own_process import READY, KilledError, OwnProcess, Tell, serve
 from sonar_graph.files.result_folder import (
-    BATCH, COMPARISON, LOCK, MANIFEST, PAPER, Manifest, digest_of, others_in, remove_written, replacing,
+    BATCH, COMPARISON, LOCK, MANIFEST, PAPER, Manifest, digest_of, others_in, refused, remove_written, replacing,
     result_folder, result_written, write_json, written_whole,
 )
 
 __all__ = [
     "BATCH", "COMPARISON", "INTERRUPTED", "KilledError", "LOCK", "MANIFEST", "Manifest", "OwnProcess", "PAPER",
     "READY", "Tell", "as_path", "deferred_interrupt", "digest_of", "end_at_once", "interrupt_event", "loading",
-    "noticed_interrupts", "others_in", "parsed_toml", "read_json", "read_toml", "regular", "remove_written",
+    "noticed_interrupts", "others_in", "parsed_toml", "read_json", "read_toml", "refused", "regular", "remove_written",
     "replacing", "result_folder", "result_written", "serve", "spelt", "strict_json", "terminations_as_interrupts",
     "text_of", "write_json", "written_whole",
 ]

@@ -7,7 +7,7 @@ import pytest
 
 from sonar_graph.recognition import Recognition, RecognitionSession, TrackStories
 from sonar_graph.recognition.track_stories import MOST_EXAMPLES
-from sonar_graph.report.tracks import write_track_page
+from sonar_graph.report import write_track_page
 from sonar_graph.sonar import Recogniser
 from tests.recognition.imaged_lane import Lane
 
