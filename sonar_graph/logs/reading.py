@@ -87,7 +87,7 @@ from sonar_graph.logs.vehicle_setup import (
     static_frames,
     unplaced,
 )
-from sonar_graph.measurements import Block, Dvl, Floats, Imu
+from sonar_graph.measurements import Block, Dvl, Imu
 from sonar_graph.sequence import Sequence
 
 LOG = logging.getLogger("sonar_graph.logs")
@@ -424,7 +424,7 @@ class Assembly:
                 text = f"{count} of {len(rows)} rows {reason}: left out{advice}"
                 self._left_out[role] = text
                 dropped = dropped | {reason: count}
-                rows = rows.rows(np.flatnonzero(~is_wrong))
+                rows = rows.rows(~is_wrong)
         self._blocks[role] = rows
         if dropped := self.topics[role].unsound | dropped:
             self._dropped[role] = dropped
@@ -466,7 +466,7 @@ class Assembly:
         """What reading a role needs beside its messages."""
         body_R_sensor = np.eye(3)
         if role == "heading":
-            body_R_sensor = self._heading_mounting().pose().rotation().matrix()
+            body_R_sensor = self._heading_mounting().rotation_matrix()
         origin = None
         if role in ("positions", "truth"):
             origin, said = common_origin(role, self.adapters, self._tables)
@@ -656,22 +656,6 @@ def common_origin(
     of_fixes = (latitude_deg, longitude_deg, math.nan)
     text += "; depths give the height, not the fixes, without `origin_deg_m` in geodetic under [positions]"
     return of_fixes if role == "positions" else origin, text
-
-
-def rows_of(
-    adapter: Any,
-    source: Any,
-    calibration: Calibration,
-    body_R_sensor: Floats,
-    origin: Origin | None,
-) -> tuple[Any, Dropped]:
-    """Rows of a table of messages, or of a topic where the adapter reads that, and the numbers left out by reason.
-
-    ``body_R_sensor`` is of the sensor of an orientation; ``origin`` of the world, in degrees and metres.
-    """
-    setup = Setup(calibration, body_R_sensor, origin)
-    found: tuple[Any, Dropped] = adapter.read(source, setup)
-    return found
 
 
 def _counts(dropped: Dropped) -> str:
