@@ -466,20 +466,18 @@ class Assembly:
         """What reading a role needs beside its messages."""
         body_R_sensor = np.eye(3)
         if role == "heading":
-            body_R_sensor = self._heading_mounting().rotation_matrix()
+            mounting: Mounting | None = self.calibration.imu.mounting
+            # an orientation of another topic than the IMU's is of the sensor of its frame
+            if self.topics[role] is not self.topics.get("imu"):
+                frame = self.adapters[role].frame_in(self._tables[role].groups)
+                mounting = mounting_of(frame, static_frames(self._recording))
+            body_R_sensor = (mounting or Mounting()).rotation_matrix()
         origin = None
         if role in ("positions", "truth"):
             origin, said = common_origin(role, self.adapters, self._tables)
             if said:
                 self._notes["log.origin"] = said
         return Setup(self.calibration, body_R_sensor, origin)
-
-    def _heading_mounting(self) -> Mounting:
-        """Mounting of the sensor of an orientation: the IMU's where it is its topic, else that of its frame."""
-        if self.topics["heading"] is self.topics.get("imu"):
-            return self.calibration.imu.mounting
-        frame = self.adapters["heading"].frame_in(self._tables["heading"].groups)
-        return mounting_of(frame, static_frames(self._recording)) or Mounting()
 
     def sequence(self, name: str | None = None) -> Sequence:
         """Everything that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,8 @@ from pydantic import ValidationError
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.files import as_path, text_of
+from sonar_graph.files import as_path
+from sonar_graph.logs.adapters import read_values
 from sonar_graph.logs.cdr import (
     Bytes,
     Value,
@@ -247,15 +247,7 @@ class PartialCalibration:
                 )
             return cls(recorded, str(path))
         kind = "JSON" if path.suffix == ".json" else "TOML"
-        try:
-            text = text_of(path)
-            values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
-        except OSError as error:
-            raise CalibrationError(
-                f"{path}: cannot be read: {error.strerror}"
-            ) from error
-        except (ValueError, RecursionError) as error:
-            raise CalibrationError(f"{path}: not {kind}: {error}") from error
+        values = read_values(path, kind, CalibrationError)
         if not isinstance(values, dict):
             what = "expected an object with sections such as imu"
             raise CalibrationError(f"{path}: {what}, not {json.dumps(values):.40}")

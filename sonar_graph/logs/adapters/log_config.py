@@ -11,6 +11,7 @@ the shipped adapter has (docs/tutorials/04_your_own_log.md)::
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -188,18 +189,21 @@ def read_log_config(path: Path) -> LogConfig:
 
     A LogError where it cannot be read, is not TOML, or states something impossible; it names table and key.
     """
-    return LogConfig.parse(read_toml(path), str(path))
+    return LogConfig.parse(read_values(path), str(path))
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file; a LogError where it cannot be read, or is not TOML."""
+def read_values(
+    path: Path, kind: str = "TOML", refusal: type[Exception] = LogError
+) -> Any:
+    """Content of a TOML or JSON file; a refusal where it cannot be read, or is not of its kind."""
     try:
-        return tomllib.loads(text_of(path))
+        text = text_of(path)
+        return json.loads(text) if kind == "JSON" else tomllib.loads(text)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    # the parser recurses into nested arrays
+        raise refusal(f"{path}: cannot be read: {error.strerror}") from error
+    # the parsers recurse into nested arrays
     except (ValueError, RecursionError) as error:
-        raise LogError(f"{path}: not TOML: {error}") from error
+        raise refusal(f"{path}: not {kind}: {error}") from error
 
 
 def as_log_config(value: LogConfig | str | Path | None, call: str) -> LogConfig | None:

@@ -34,7 +34,7 @@ from sonar_graph.logs.adapters import (
     Setup,
     did_you_mean,
     plain_lines,
-    read_toml,
+    read_values,
 )
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.convert.csv_evidence import marked_valid, time_units
@@ -194,7 +194,7 @@ def read_csv(
     values = config
     if not isinstance(values, Mapping):
         source = str(config)
-        values = read_toml(as_path(config, "read_csv(tables, config)"))
+        values = read_values(as_path(config, "read_csv(tables, config)"))
         name = name or spelt(Path(source).stem)
     roles = parse_csv_config(values, source)
     found = {role: _table(one, files, source) for role, one in roles.items()}
