@@ -76,7 +76,7 @@ class Windows(NamedTuple):
         """Mean rates of change of a quantity, shape (n, 3); NaN for a row that is a part of its own."""
         duration_s = self.end_s - self.begin_s
         duration_s = np.where(duration_s > 0.0, duration_s, np.nan)
-        return np.asarray((at(self.end_s) - at(self.begin_s)) / duration_s[:, None])
+        return (at(self.end_s) - at(self.begin_s)) / duration_s[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +111,13 @@ class BodyMotion:
         dvl = sequence.dvl
         calibration = sequence.calibration
         imu = sequence.imu
-        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        body_R_imu = calibration.imu.mounting.rotation_matrix()
         unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
         force = filled(imu.specific_force) - calibration.imu.accel_bias_m_s2
         force = force @ body_R_imu.T
         path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, force))
         t = path.since_origin(dvl.stamps_ns)  # (n,)
-        rows = path.covers(t) & np.isfinite(dvl.velocity).all(axis=1)
+        rows = path.covers(t)
         # stamps may repeat: of such rows the first counts
         rows[1:] &= np.diff(t) > 0
         t = t[rows]
@@ -222,7 +222,7 @@ class BodyMotion:
 
     def since_origin(self, stamps_ns: Ints) -> Floats:
         """Seconds of stamps on this motion's axis."""
-        return np.asarray((stamps_ns - self.origin_ns) / NS_PER_S)
+        return (stamps_ns - self.origin_ns) / NS_PER_S
 
     def stretches(
         self,
@@ -275,7 +275,7 @@ def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
     up_at_imu = columns_at(path.seconds, t, up_in_path)
     up = np.einsum("nji,nj->ni", path.rotations, up_at_imu)
     along = path.rate[:, 1] * up[:, 1] + path.rate[:, 2] * up[:, 2]
-    return np.asarray(along / np.maximum(up[:, 1] ** 2 + up[:, 2] ** 2, LEAST_LEVEL))
+    return along / np.maximum(up[:, 1] ** 2 + up[:, 2] ** 2, LEAST_LEVEL)
 
 
 def felt_gravity(

@@ -87,7 +87,7 @@ class SignalStretch:
     def slope(self, lag_s: float) -> Values:
         """Derivative of x by time at the rows, shape (n,)."""
         before, after = self.shifted(lag_s + LAG_STEP_S * np.array([1.0, -1.0]))
-        return np.asarray((after - before) / (2 * LAG_STEP_S))
+        return (after - before) / (2 * LAG_STEP_S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class Match:
 
     def less_certain(self, sigma: float) -> "Match":
         """The same with an error of the gain by what the comparison leaves out."""
-        whole = float(np.hypot(self.gain.sigma, sigma))
+        whole = np.hypot(self.gain.sigma, sigma)
         return replace(self, gain=replace(self.gain, sigma=whole))
 
     @classmethod
@@ -445,7 +445,7 @@ def centred(values: Values, stretch: SignalStretch) -> Values:
     """Values about their mean, but for changes."""
     known = values[np.isfinite(values)]
     has_mean = stretch.has_offset and len(known)
-    return np.asarray(values - known.mean()) if has_mean else values
+    return values - known.mean() if has_mean else values
 
 
 def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
@@ -458,7 +458,7 @@ def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
         return x * np.nan
     t = stretch.seconds - stretch.seconds.mean()
     line = np.polynomial.Polynomial.fit(t[known], x[known], 1)
-    return np.asarray(x - line(t))
+    return x - line(t)
 
 
 def root_mean_square(parts: list[Values]) -> float:
@@ -475,4 +475,4 @@ def weighted(estimates: list[tuple[float, float]]) -> Estimate1D:
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
     mean = float(weights @ values / weights.sum())
     scatter = float(weights @ (values - mean) ** 2) / max(len(values) - 1, 1)
-    return Estimate1D(mean, float(np.sqrt(max(scatter, 1.0) / weights.sum())))
+    return Estimate1D(mean, np.sqrt(max(scatter, 1.0) / weights.sum()))

@@ -191,7 +191,7 @@ ACCEL_BIAS_LIMIT_M_S2 = 0.05
 GYRO_BIAS_LIMIT_RAD_S = 5e-3
 NO_MANOEUVRES = "too little acceleration"
 NO_TURNS = "too little turning"
-Estimates3D = tuple[Estimate1D, Estimate1D, Estimate1D]
+Estimates3D = tuple[Estimate1D, ...]
 """Along x, y and z of the body."""
 
 
