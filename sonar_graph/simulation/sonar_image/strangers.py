@@ -13,7 +13,9 @@ from sonar_graph.simulation.sonar_image.scene import (
     SeabedObject,
     Shape,
     block,
+    material,
     place,
+    ragged_outline,
     stone,
 )
 
@@ -39,7 +41,7 @@ def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> 
         # angle from the middle of the nearest side
         from_side = np.arctan2(y_m, x_m) % step - step / 2
         inside = np.hypot(x_m, y_m) * np.cos(from_side) < apothem_m
-        return np.where(inside, level_db, np.nan), np.where(inside, height_m, 0.0)
+        return material(inside, level_db, height_m)
 
     return shape
 
@@ -57,10 +59,7 @@ def rimmed_disc(
             + dome_m * np.clip(1 - (away / radius_m) ** 2, 0, 1)
             + np.where(away < knob_m, 0.02, 0.0)
         )
-        level_db = np.where(is_rough, 9.0, -2.0)
-        return np.where(away < radius_m, level_db, np.nan), np.where(
-            away < radius_m, top, 0.0
-        )
+        return material(away < radius_m, np.where(is_rough, 9.0, -2.0), top)
 
     return shape
 
@@ -69,19 +68,14 @@ def boulder(
     radius_m: float, height_m: float, level_db: float, rng: np.random.Generator
 ) -> Shape:
     """A stone of random outline and lumpy top: half an ellipsoid whose radius varies with direction."""
-    order = np.arange(1, 5)
-    waves = rng.normal(0, 0.16 / np.sqrt(order), (2, len(order)))
+    outline = ragged_outline(radius_m, (0.5, 1.4), 4, 0.16, rng)
     # stones are longer than wide, and not smooth on top
     flattened = rng.uniform(0.6, 1.0)
     lumps = rng.uniform(0, 2 * np.pi, 2)
     lump_m = 0.5 * radius_m
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-        angle = np.arctan2(y_m, x_m)[..., None] * order
-        outline = radius_m * np.clip(
-            1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.5, 1.4
-        )
-        from_top = (np.hypot(x_m, y_m / flattened) / outline) ** 2
+        from_top = (np.hypot(x_m, y_m / flattened) / outline(x_m, y_m)) ** 2
         lumpy = 1 + 0.2 * np.sin(x_m / lump_m * np.pi + lumps[0]) * np.sin(
             y_m / lump_m * np.pi + lumps[1]
         )
@@ -186,15 +180,15 @@ def _round_stone(rng: np.random.Generator) -> Drawn:
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
-    **{
-        "stone": _boulder,
-        "weed": _tuft,
-        "stick": _stick,
-        "lid": _lid,
-        "tile": _tile,
-        "hexagon": _hexagon,
-    },
-    **{"pan-lid": _pan_lid, "box": _box, "round-stone": _round_stone},
+    "stone": _boulder,
+    "weed": _tuft,
+    "stick": _stick,
+    "lid": _lid,
+    "tile": _tile,
+    "hexagon": _hexagon,
+    "pan-lid": _pan_lid,
+    "box": _box,
+    "round-stone": _round_stone,
 }
 """How each kind is drawn. lid: a flat rough disc; tile: a square one; box: 5 cm high; pan-lid: a dome with rim and
 knob; round-stone: half an ellipsoid, stone: one of random outline."""
