@@ -92,12 +92,7 @@ class FloorView:
         cos = math.cos(bearing_rad)
         sin = math.sin(bearing_rad)
         ahead_R_level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return FloorView(
-            ahead_R_level @ self.level_R_sonar,
-            self.height_m,
-            self.height_sigma_m,
-            self.tilt_sigma_rad,
-        )
+        return replace(self, level_R_sonar=ahead_R_level @ self.level_R_sonar)
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
         """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""

@@ -30,7 +30,6 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr
 
 from sonar_graph.calibration import Section
-from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.models import project_points, wrap_angle
 from sonar_graph.numerics import chi_square_quantile
@@ -251,12 +250,8 @@ class Tracker:
     ) -> Association:
         """Predict the tracks by the motion since the frame before or the last `skip` (None: none), and update them.
 
-        Raises `MeasurementError` when the stamp is not later.
+        Stamps increase: `FrameCheck` refuses other frames.
         """
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            raise MeasurementError(
-                f"sonar frame at {stamp_ns} ns is not later than the one before, {self._stamp_ns} ns; leave it out"
-            )
         params = self.params
         rows = candidates.accepted
         elapsed_s = (
@@ -327,11 +322,10 @@ class Tracker:
         reasons: list[str],
     ) -> Association:
         """Keep the tracks without a reason to end, start new ones, and associate them with the tracks before."""
-        stay = np.flatnonzero([not reason for reason in reasons])
-        ended = np.flatnonzero([bool(reason) for reason in reasons])
-        new = np.array(
-            sorted(set(range(len(matrix))).difference(took.tolist())), dtype=np.int64
-        )
+        is_ended = np.array(reasons, dtype=bool)
+        stay = np.flatnonzero(~is_ended)
+        ended = np.flatnonzero(is_ended)
+        new = np.setdiff1d(np.arange(len(matrix)), took)
         rows = np.append(took[stay], new)
         previous_ids = after.ids
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
