@@ -176,11 +176,11 @@ class SonarWorker:
     def _work(self) -> None:
         try:
             self._process.answer()  # that it is ready
-            self._ask(WARM_UP)
+            self._process.ask(WARM_UP)
             self.is_warm.set()
             with self._changed:
                 self._changed.wait_for(lambda: self._begin or self._is_ended)
-            self._ask(self._begin)
+            self._process.ask(self._begin)
             self.has_begun.set()
             while True:
                 with self._changed:
@@ -188,7 +188,7 @@ class SonarWorker:
                     if self._is_ended:
                         return
                     one = self._waiting.pop(0)
-                answer = self._ask(one.rows)
+                answer = self._process.ask(one.rows)
                 if isinstance(answer, SonarAnswer):
                     self._seen(answer)
         except Exception as error:  # of the process, or because it was ended
@@ -196,7 +196,3 @@ class SonarWorker:
         finally:
             self.is_warm.set()
             self.has_begun.set()
-
-    def _ask(self, request: object) -> Any:
-        self._process.send(request)
-        return self._process.answer()
