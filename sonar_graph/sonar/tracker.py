@@ -30,7 +30,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr
 
 from sonar_graph.calibration import Section
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Columns, Floats, Ints
 from sonar_graph.models import project_points, wrap_angle
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sonar.geometry import point_covariances, points
@@ -83,7 +83,7 @@ class SonarStep:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackStates:
+class TrackStates(Columns):
     """States of M tracks, one row each."""
 
     ids: Ints
@@ -105,15 +105,6 @@ class TrackStates:
 
     def __len__(self) -> int:
         return len(self.ids)
-
-    def rows(self, selection: Ints) -> TrackStates:
-        """The selected rows, in this order."""
-        return TrackStates(*(column[selection] for column in vars(self).values()))
-
-    def and_(self, other: TrackStates) -> TrackStates:
-        """These tracks, then the others."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return TrackStates(*(np.concatenate(pair) for pair in pairs))
 
     def moved(self, step: SonarStep, drift_m: float) -> TrackStates:
         """Prediction: the tracks in the sonar frame after a step."""
@@ -355,11 +346,9 @@ class Tracker:
             )
             ids = self._next_id + np.arange(n)
             self._next_id += n
-            tracks = tracks.and_(
-                TrackStates(
-                    ids, position, covariance, existence, np.ones(n, dtype=np.int64)
-                )
-            )
+            seen = np.ones(n, dtype=np.int64)
+            started = TrackStates(ids, position, covariance, existence, seen)
+            tracks = TrackStates.concatenate([tracks, started])
         self._tracks = tracks
         return Association(
             **vars(tracks),
