@@ -46,28 +46,30 @@ def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> 
     return shape
 
 
-def rimmed_disc(
-    radius_m: float, rim_m: float, rim_height_m: float, dome_m: float, knob_m: float
-) -> Shape:
+def _pan_lid(rng: np.random.Generator) -> Drawn:
     """A round lid: 2 dB under the floor where it is smooth, 9 dB over it on rim and knob; it rises to a dome."""
+    radius_m = rng.uniform(0.11, 0.15)
+    dome_m = rng.uniform(0.015, 0.03)
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         away = np.hypot(x_m, y_m)
-        is_rough = ((away > radius_m - rim_m) & (away < radius_m)) | (away < knob_m)
+        is_knob = away < 0.02
+        is_rough = ((away > radius_m - 0.012) & (away < radius_m)) | is_knob
         top = (
-            rim_height_m
+            0.01
             + dome_m * np.clip(1 - (away / radius_m) ** 2, 0, 1)
-            + np.where(away < knob_m, 0.02, 0.0)
+            + np.where(is_knob, 0.02, 0.0)
         )
         return material(away < radius_m, np.where(is_rough, 9.0, -2.0), top)
 
-    return shape
+    return shape, radius_m
 
 
-def boulder(
-    radius_m: float, height_m: float, level_db: float, rng: np.random.Generator
-) -> Shape:
+def _boulder(rng: np.random.Generator) -> Drawn:
     """A stone of random outline and lumpy top: half an ellipsoid whose radius varies with direction."""
+    radius_m = rng.uniform(0.08, 0.17)
+    height_m = rng.uniform(0.03, 0.09)
+    level_db = rng.uniform(4, 11)
     outline = ragged_outline(radius_m, (0.5, 1.4), 4, 0.16, rng)
     # stones are longer than wide, and not smooth on top
     flattened = rng.uniform(0.6, 1.0)
@@ -83,17 +85,15 @@ def boulder(
             np.clip(1 - from_top, 0, None)
         )
 
-    return shape
+    return shape, 1.4 * radius_m
 
 
-def tuft(
-    radius_m: float,
-    height_m: float,
-    level_db: float,
-    fronds: int,
-    rng: np.random.Generator,
-) -> Shape:
+def _tuft(rng: np.random.Generator) -> Drawn:
     """Weed: narrow fronds from one root, which lie over the floor and between which it shows."""
+    radius_m = rng.uniform(0.12, 0.2)
+    height_m = rng.uniform(0.03, 0.08)
+    level_db = rng.uniform(4, 9)
+    fronds = int(rng.integers(10, 24))
     # each frond is a parabola from the root
     angle = rng.uniform(-np.pi, np.pi, fronds)
     length_m = radius_m * rng.uniform(0.4, 1.0, fronds)
@@ -122,25 +122,7 @@ def tuft(
             )
         return level, top
 
-    return shape
-
-
-def _tuft(rng: np.random.Generator) -> Drawn:
-    radius_m = rng.uniform(0.12, 0.2)
-    shape = tuft(
-        radius_m,
-        rng.uniform(0.03, 0.08),
-        rng.uniform(4, 9),
-        int(rng.integers(10, 24)),
-        rng,
-    )
     return shape, 1.2 * radius_m
-
-
-def _boulder(rng: np.random.Generator) -> Drawn:
-    radius_m = rng.uniform(0.08, 0.17)
-    height_m = rng.uniform(0.03, 0.09)
-    return boulder(radius_m, height_m, rng.uniform(4, 11), rng), 1.4 * radius_m
 
 
 def _stick(rng: np.random.Generator) -> Drawn:
@@ -162,11 +144,6 @@ def _tile(rng: np.random.Generator) -> Drawn:
 def _hexagon(rng: np.random.Generator) -> Drawn:
     radius_m = rng.uniform(0.13, 0.17)
     return polygon(radius_m, 6, 0.013, rng.uniform(8, 12)), radius_m
-
-
-def _pan_lid(rng: np.random.Generator) -> Drawn:
-    radius_m = rng.uniform(0.11, 0.15)
-    return rimmed_disc(radius_m, 0.012, 0.01, rng.uniform(0.015, 0.03), 0.02), radius_m
 
 
 def _box(rng: np.random.Generator) -> Drawn:
