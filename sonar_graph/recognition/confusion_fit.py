@@ -38,7 +38,6 @@ from sonar_graph.sonar import (
     TrackInFrame,
     confusion_for,
     mark_of,
-    posterior_mean_rows,
     read_confusion,
     soft_scores,
 )
@@ -51,6 +50,8 @@ LEAST_FRAMES = 3
 """Labelled frames from which a class is measured."""
 LEAST_FOR_ENDS = 40
 """So many tracks have one beyond each end of the range that holds 95 %."""
+JEFFREYS = 0.5
+"""Prior count of each feature of the confusion matrix."""
 PRIOR_SHARE = 0.25
 """Standard deviation of what is fitted about the shipped model, as a share of it; of looks, of their logarithm."""
 
@@ -457,11 +458,14 @@ def report_interval_s(
 def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:
     """Confusion matrix from the soft scores of frames, for classes with these numbers of trials.
 
-    Frames of a track repeat each other, so that tracks are the trials, not frames.
+    Its rows are posterior means under Jeffreys' Dirichlet prior, ``C[k, j] = (n_k m_kj + 1/2) / (n_k + features / 2)``
+    with the mean scores m of n_k independent trials of class k: a confusion that never happened in n trials keeps about
+    1 / 2n. Frames of a track repeat each other, so that tracks are the trials, not frames.
     """
     sums = np.array([scores[label == k].sum(axis=0) for k in range(scores.shape[1])])
     means = sums / np.maximum(np.bincount(label, minlength=len(sums)), 1)[:, None]
-    return posterior_mean_rows(means, trials)
+    n = trials[:, None]
+    return (n * means + JEFFREYS) / (n + JEFFREYS * len(sums))
 
 
 def fit_weights(

@@ -49,11 +49,16 @@ class _Tilt:
             began_at_epoch = self.epoch_ns in self._odometry.epochs(
                 self.epoch_ns - 1, instant_ns
             )
-            measured = (
-                self._gravity(motion, epoch_ns)
-                if self._calibration.use_gravity and began_at_epoch
-                else None
-            )
+            measured = None
+            if self._calibration.use_gravity and began_at_epoch:
+                (before, variance), (after, other) = map(
+                    self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns)
+                )
+                sigma = float(np.sqrt(0.5 * (variance + other)))
+                # direction of up at the epoch, and its standard deviation
+                measured = gravity_direction(
+                    motion, before, after, sigma, self._calibration
+                )
             # predict by the gyros first, then correct by gravity
             self.up, self.variance = self.after(motion)
             if measured is not None:
@@ -73,16 +78,6 @@ class _Tilt:
             motion.i_T_j.rotation().matrix().T @ self.up,
             self.variance + noise + drift**2,
         )
-
-    def _gravity(
-        self, motion: PreintegratedMotion, epoch_ns: int
-    ) -> tuple[Floats, float] | None:
-        """Measured direction of up at an epoch, and its standard deviation."""
-        (before, variance), (after, other) = map(
-            self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns)
-        )
-        sigma = float(np.sqrt(0.5 * (variance + other)))
-        return gravity_direction(motion, before, after, sigma, self._calibration)
 
 
 class _Height:

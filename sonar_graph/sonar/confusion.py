@@ -7,8 +7,8 @@ Classes and features are the designs in their order, last "none". With phi_k the
 
 The log odds of a track are the mean of l over its looks, times ``W / (W + looks)`` with W the number of independent
 looks: they are bounded, because what was not foreseen of a landmark repeats from look to look. ``matrix[k, j] =
-p(z = j | x = k)`` is the posterior mean of the score of feature j given class k (`posterior_mean_rows`), a score being
-the posterior of one look.
+p(z = j | x = k)`` is the posterior mean of the score of feature j given class k, a score being the posterior of one
+look.
 
 The model that ships, ``default_confusion.json``, was measured on simulated basins with the designs that ship.
 `sonar_graph.recognition.confusion_fit` measures others.
@@ -28,14 +28,12 @@ from sonar_graph.calibration import Section
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
 from sonar_graph.files import text_of
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in
 from sonar_graph.sonar.evidence import EVIDENCE
 
 SHIPPED = Path(__file__).with_name("default_confusion.json")
 """The model of the designs that ship."""
-JEFFREYS = 0.5
-"""Prior count of each feature."""
 ASSUMED_RIGHT = 0.9
 """Share of frames in which an unmeasured landmark is assumed to show its own feature."""
 
@@ -211,16 +209,6 @@ class Confusion(Section):
 
 def _listed(ids: Sequence[int]) -> str:
     return ", ".join(map(str, ids))
-
-
-def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
-    """Posterior mean of each row of a confusion matrix, shape (classes, features), under Jeffreys' Dirichlet prior.
-
-    ``C[k, j] = (n_k m_kj + 1/2) / (n_k + features / 2)`` with the mean scores m of n_k independent trials of class k: a
-    confusion that never happened in n trials keeps about 1 / 2n.
-    """
-    n = trials[:, None]
-    return (n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1])
 
 
 def mark_of(design: LandmarkDesign) -> DesignMark:
