@@ -316,7 +316,9 @@ class Tracker:
         is_ended = np.array(reasons, dtype=bool)
         stay = np.flatnonzero(~is_ended)
         ended = np.flatnonzero(is_ended)
-        new = np.setdiff1d(np.arange(len(matrix)), took)
+        is_new = np.ones(len(matrix), dtype=bool)
+        is_new[took[took >= 0]] = False
+        new = np.flatnonzero(is_new)
         rows = np.append(took[stay], new)
         previous_ids = after.ids
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
