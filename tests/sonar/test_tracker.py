@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from sonar_graph.errors import MeasurementError
 from sonar_graph.sonar import SonarStep
 from sonar_graph.sonar.tracker import (
     Expected,
@@ -204,11 +203,3 @@ def test_what_leaves_the_image_ends_and_is_not_held_against_it(inside_m, ahead):
     assert out.ended_ids.tolist() == before.ids.tolist() or out.existence[0] > 0.99
     gone = tracker.step(candidates_at([], []), moved_by(0.3 * ahead), 21 * FRAME_NS)
     assert "left the image" in out.ended_reasons + gone.ended_reasons
-
-
-def test_frames_that_are_not_later_are_refused():
-    tracker = Tracker()
-    run(tracker, [[(2.0, 0.0)]])
-    for later_ns in (0, -1):
-        with pytest.raises(MeasurementError, match="not later"):
-            tracker.step(candidates_at([2.0], [0.0]), STILL, FRAME_NS + later_ns)
