@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames
-from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image import (
     FrameSimulator,
     ImageOptions,
@@ -23,88 +21,13 @@ from sonar_graph.sonar.appearance import (
     CandidateFit,
     DesignFit,
 )
-from sonar_graph.sonar.place import Grid, Lit, Relief
+from sonar_graph.sonar.place import Grid, Relief
 from sonar_graph.sonar.templates import Patch, check_headings
 
 from .polar_images import candidates_at, design_of
 
 CELL_M = 0.015
-SIDE = 37
 BLUR_M = (0.008, 0.01)
-SIDE_M = 0.007
-SHADE_STEPS = 3
-LONGER = 0.6
-"""The shadow is 3.6 steps of half a cell long."""
-ROWS_COLUMNS = tuple(np.indices((SIDE, SIDE)).reshape(2, -1))
-RELIEF = Relief.of(DEFAULT_DESIGNS[2], 0.3, Grid(SIDE, CELL_M, BLUR_M), SHADE_STEPS)
-
-
-def columns(relief: Relief = RELIEF) -> list[Floats]:
-    """B with its side, D where no shadow lies on it, and S, written out."""
-    shade = relief.shorter * (1 - LONGER) + relief.longer * LONGER
-    return [relief.figure + SIDE_M * relief.side, relief.dark * (1 - shade), shade]
-
-
-def patch_with(
-    levels: tuple[float, float, float, float],
-    at: tuple[int, int],
-    noise_db: float,
-    seed: int,
-) -> Floats:
-    """Levels (floor, beta, delta, gamma) of the figure at a cell of a patch of 47 by 47, with white noise."""
-    patch = np.full((47, 47), levels[0]) + np.random.default_rng(seed).normal(
-        0, noise_db, (47, 47)
-    )
-    for level, column in zip(levels[1:], columns(), strict=True):
-        patch[at[0] : at[0] + SIDE, at[1] : at[1] + SIDE] += level * column
-    return patch.astype(np.float32)
-
-
-def place_in(
-    patch: Floats, start: tuple[float, float], seen: Floats | None = None
-) -> tuple[Floats, Floats]:
-    held = np.ones_like(patch) if seen is None else seen
-    return RELIEF.place(
-        Patch.of(patch, held, np.zeros(2)),
-        ROWS_COLUMNS,
-        np.array(start),
-        Lit(SIDE_M, LONGER),
-    )
-
-
-def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
-    """By `scipy.optimize.least_squares` on the same tangents."""
-    patch = patch_with((40, 0.7, 0.5, -9.0), (5, 6), 3.0, 2)
-    x = 5
-    y = 6
-    seen = np.ones((47, 47), np.float32)
-    seen[:, 33:] = 0
-    place, bound = place_in(patch, (x, y), seen)
-    held = seen[x : x + SIDE, y : y + SIDE] > 0
-    z = patch[x : x + SIDE, y : y + SIDE][held].astype(float)
-    parts = columns()
-    slopes = [np.gradient(part) for part in parts]
-
-    def residuals(q: Floats) -> Floats:
-        floor, *levels, dx, dy = q
-        shifted = [
-            c - dx * s[0] - dy * s[1] for c, s in zip(parts, slopes, strict=True)
-        ]
-        return (
-            z
-            - floor
-            - sum(level * part for level, part in zip(levels, shifted, strict=True))[
-                held
-            ]
-        )
-
-    found = least_squares(residuals, [40, 1, 0.3, -5, 0, 0])
-    np.testing.assert_allclose(place - (x, y), found.x[4:], atol=0.02)
-    mean_square = np.mean(found.fun**2)
-    expected = np.sqrt(
-        mean_square * np.diag(np.linalg.inv(found.jac.T @ found.jac))[4:]
-    )
-    np.testing.assert_allclose(bound, expected, rtol=0.03)
 
 
 AN_L = (0.0, -0.12, 0.17, 0.05), (-0.12, 0.05, 0.05, 0.12)
