@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
-from sonar_graph.models import range_azimuth
+from sonar_graph.models import RobustKernel, range_azimuth
 from sonar_graph.slam import factors
-from sonar_graph.slam.odometry_factor import OdometryWithBias
+from sonar_graph.slam.factors import SightingStack
+from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
 from sonar_graph.testing import check_jacobians
 
 from .graphs import information
@@ -288,3 +289,65 @@ def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
     assert graph.error(values_of(X0=pose)) < 1e-6
     off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
     assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
+
+
+def assert_is_each_of(made, stack, values: gtsam.Values) -> None:
+    """Errors and linearisations of a stack are those of its factors one by one."""
+    assert stack.error(values) == pytest.approx(
+        sum(factor.error(values) for factor in made), rel=1e-12
+    )
+    for found, factor in zip(stack.linear_factors(values), made, strict=True):
+        mine = found.augmentedInformation()
+        theirs = factor.linearize(values).augmentedInformation()
+        assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9 * np.abs(theirs).max())
+
+
+def test_correlated_sightings_together_are_what_each_is():
+    """Under no kernel and two others, wherever the landmarks lie about the sonars."""
+    rng = np.random.default_rng(6)
+    values = gtsam.Values()
+    made = []
+    kernels = [
+        plain,
+        RobustKernel(shape="huber").robust(),
+        RobustKernel(shape="cauchy").robust(),
+    ]
+    for k in range(5):
+        values.insert(X(k), gtsam.Pose3.Expmap(rng.standard_normal(6)))
+        values.insert(L(k), 3.0 * rng.standard_normal(3))
+    for k in range(60):
+        body_T_sonar = gtsam.Pose3.Expmap(rng.standard_normal(6))
+        half = 0.1 * rng.standard_normal((2, 2))
+        z = rng.uniform((1.0, -3.0), (5.0, 3.0))
+        cov = half @ half.T + 1e-3 * np.eye(2)
+        keys = X(int(rng.integers(5))), L(int(rng.integers(5)))
+        made.append(
+            factors.CorrelatedSighting(
+                *keys, body_T_sonar, z, kernels[k % 3](factors.gaussian(cov))
+            )
+        )
+    assert_is_each_of(made, SightingStack(made), values)
+
+
+def test_odometry_factors_together_are_what_each_is():
+    """Errors and derivatives, of small and large residuals and corrections, with poses and biases in common."""
+    rng = np.random.default_rng(5)
+    values = gtsam.Values()
+    made = []
+    for b in range(3):
+        values.insert(B(b), 0.3 * rng.standard_normal(11))
+    for k in range(40):
+        spread = 10.0 ** rng.uniform(-6, 0.3)
+        motion = some_motion(k, 0.05)
+        values.insert(X(k), gtsam.Pose3.Expmap(rng.standard_normal(6)))
+        if k % 2:
+            X_j = values.atPose3(X(k - 1)).compose(
+                motion.corrected(values.atVector(B(k % 3)))
+            )
+            values.update(
+                X(k), X_j.compose(gtsam.Pose3.Expmap(spread * rng.standard_normal(6)))
+            )
+        if k:
+            up = values.atPose3(X(k)).rotation().matrix()[2] if k % 3 else np.zeros(3)
+            made.append(OdometryWithBias(X(k - 1), X(k), B(k % 3), motion, up))
+    assert_is_each_of(made, OdometryStack(made), values)
