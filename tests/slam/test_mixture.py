@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 from sonar_graph.measurements import Floats
 from sonar_graph.models import Kernel
 from sonar_graph.slam import GaussianKernel, RobustKernel
+from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.mixture import (
     REPEATED_LOSS,
     IdentityPosterior,
@@ -165,3 +166,43 @@ def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     best, second = sorted(total, key=total.__getitem__, reverse=True)[:2]
     assert tuple(found) == best
     assert total[best] > total[second] + 1e-3
+
+
+SAID = {7: 0.9}
+HERE = PLACES[7]
+THERE = PLACES[7] + np.array([0.0, 0.4, 0.0])
+
+
+def vote(watches: list[TrackedObject], point: Floats) -> float:
+    values = world()
+    weight, none = log_weights(SAID, 7)
+    gains = (
+        weight + log_density(values, w, point) - none - of_nothing(w) for w in watches
+    )
+    return sum(max(gain, 0.0) for gain in gains)
+
+
+@pytest.mark.parametrize(
+    ("here", "there"), [(6, 2), (6, 5), (4, 4), (2, 6), (1, 3), (0, 2)]
+)
+@pytest.mark.parametrize("strays", [0, 1, 3])
+def test_the_place_with_most_votes_wins_whatever_lies_far_off(
+    here: int, there: int, strays: int
+) -> None:
+    """What fits nowhere has no voice, however far off it is; summed errors would be drawn to it."""
+    values = world()
+    far = [HERE + np.array([0.0, 1.2 + 0.5 * k, 0.0]) for k in range(strays)]
+    rng = np.random.default_rng(3)
+    points = [HERE] * here + [THERE] * there + far
+    watches = [
+        watch(values, point, [0], 0.3 * rng.standard_normal((1, 2)), SAID)
+        for point in points
+    ]
+    elsewhere = [seen.sightings[0].line.point(values) for seen in watches[here:]]
+    best = max(elsewhere, key=lambda p: vote(watches, p))
+    is_moved = bool(vote(watches, best) >= vote(watches, HERE) + mixture.LEAST_MARGIN)
+    choices = [7] * here + [None] * (len(watches) - here)
+    supporters = mixture.supporters_elsewhere(7, watches, choices, values, MIXTURE)
+    assert (supporters is not None) is is_moved is (there > here)
+    if supporters is not None:
+        assert supporters == watches[here : here + there]

@@ -5,12 +5,16 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
+from sonar_graph.models import RobustKernel
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import (
     FactorGroup,
+    Sightline,
     batch_solution,
     solve,
 )
+from sonar_graph.slam.smoother.factor_store import graph_of as graph_of_groups
+from sonar_graph.slam.smoother.window import Thresholds, WholeWindow
 
 from .fed import (
     FOREVER_S,
@@ -32,6 +36,7 @@ from .made import (
     polar,
     pose_prior,
     smoother_with,
+    values_of,
 )
 from .rail import STEP_S, Rail, rail
 
@@ -206,6 +211,44 @@ def test_a_bounded_window_restarts_when_a_landmark_has_moved(
     smoother.add({"prior": point_prior(L(1), [shift_m, 0.0, 0.0], 0.01)})
     smoother.update(0.0)
     assert bool(solved) == is_due
+
+
+def seen_from_origin(landmark: int, z: np.ndarray) -> FactorGroup:
+    """One robust sighting from the first keyframe, with a prior that keeps the landmark determined."""
+    key = L(landmark)
+    noise = np.diag(np.square([0.1, 0.02]))
+    made = factors.landmark_sighting(
+        X(0), key, gtsam.Pose3(), z, noise, RobustKernel().robust()
+    )
+    made["prior"] = point_prior(key, np.array([10.0, 0.0, 0.0]), 5.0)
+    return FactorGroup(made, (key, Sightline(X(0), gtsam.Pose3(), z)))
+
+
+def test_sightings_in_one_factor_keep_their_information():
+    """Ten sightings of two landmarks from one keyframe, with robust kernels; then two leave, and three of a factor stay."""
+    rng = np.random.default_rng(3)
+    z = np.array([10.0, 0.1]) + rng.normal(0.0, [0.2, 0.04], (10, 2))
+    groups = {k: seen_from_origin(k % 2, polar) for k, polar in enumerate(z)}
+    values = values_of(
+        X0=gtsam.Pose3(), L0=np.array([10.0, 1.0, 0.0]), L1=np.array([10.0, 1.2, 0.0])
+    )
+    groups[10] = FactorGroup({"prior": pose_prior(X(0), gtsam.Pose3(), 0.1)})
+    window = WholeWindow(Thresholds(1e-9, 1e-9))
+    window.update(groups, values, removed=(), relinearises=True)
+    assert window.isam.getFactorsUnsafe().nrFactors() == 3
+    ordering = gtsam.Ordering([X(0), L(0), L(1)])
+    for removed in ((), (3, 5)):
+        window.update({}, gtsam.Values(), removed=removed, relinearises=True)
+        for handle in removed:
+            del groups[handle]
+        held = window.isam.getFactorsUnsafe().linearize(values)
+        apart = graph_of_groups(groups.values()).linearize(values)
+        np.testing.assert_allclose(
+            held.augmentedHessian(ordering),
+            apart.augmentedHessian(ordering),
+            rtol=1e-12,
+            atol=1e-9,
+        )
 
 
 @pytest.mark.parametrize("is_wild", [True, False])
