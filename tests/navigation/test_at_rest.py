@@ -19,9 +19,12 @@ from sonar_graph.navigation import PreintegratedMotion
 from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, noise_densities
 from sonar_graph.navigation.alignment.allan import allan_deviation
 from sonar_graph.navigation.alignment.at_rest import (
+    angles_by_up,
     earth_up_and_level,
+    roll_and_pitch,
 )
-from sonar_graph.testing import check_consistent
+from sonar_graph.testing import check_consistent, check_derivative
+from sonar_graph.testing.numerical import central_differences
 
 from . import ways
 from .rows import NS, at, dvl
@@ -218,6 +221,25 @@ def test_the_earth_turns_north_at_the_equator_and_up_at_the_north_pole(
     assert 360 / np.linalg.norm(found) == pytest.approx(23.9345, abs=1e-4)
     assert earth_rate_in_world(Calibration()) is None
     assert earth_up_and_level(Calibration()) == (0.0, 0.0)
+
+
+ATTITUDES = [(0.3, -0.4), (-2.8, 1.2), (0.0, 0.0), (1.5, -1.5)]
+
+
+@pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
+def test_the_derivative_is_that_of_turning_up_a_little(roll, pitch):
+    """Along the sphere; a change of length changes neither angle."""
+    up = Rotation.from_euler("ZYX", [0.7, pitch, roll]).inv().apply([0, 0, 1.0])
+
+    def angles(phi: np.ndarray) -> tuple[float, float]:
+        return roll_and_pitch(Rotation.from_rotvec(phi).apply(up))
+
+    still = np.zeros(3)
+    by_turn = central_differences(
+        lambda phi: Rotation.from_rotvec(phi).apply(up), still
+    )
+    check_derivative(angles, angles_by_up(up) @ by_turn, still)
+    assert angles_by_up(up) @ up == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
 RATE_HZ = 50.0

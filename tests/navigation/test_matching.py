@@ -15,11 +15,14 @@ from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
     Estimate1D,
+    InertialPath,
     match_dvl_to_imu,
     match_reference_to_imu,
     stretches_of,
 )
+from sonar_graph.navigation.alignment.dvl_imu import Averaged, velocity_changes
 from sonar_graph.navigation.alignment.reference_offset import ReferenceMatch
+from sonar_graph.navigation.alignment.time_offset import SampleSeries
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
@@ -142,6 +145,41 @@ def test_turning_about_one_axis_tells_the_arm_across_it_alone():
         assert_found(one, truth, 0.1)
     assert not found.lever[2].is_known
     assert found.lever[2].reason == "too little turning"
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(
+    ("kind", "column", "size"),
+    [("lever", 4, 0.1), ("force", 7, 1e-3), ("gyro", 10, 1e-4)],
+)
+def test_derivatives_are_those_of_what_is_lined_up(
+    kind: str, column: int, size: float, axis: int
+):
+    """The first stretch with an arm or a bias of its own, less without: the column, but for gravity and its turning."""
+
+    def first(change: np.ndarray) -> SampleSeries:
+        arm, rate, force = (
+            change if kind == name else np.zeros(3)
+            for name in ("lever", "gyro", "force")
+        )
+        imu, dvl = on_a_plane(arm)
+        path = InertialPath.of(
+            Imu(imu.stamps_ns, imu.angular_velocity + rate, imu.specific_force + force)
+        )
+        seconds = path.since_origin(dvl.stamps_ns)[:150]
+        run = Averaged.of(slice(0, 150), seconds)
+        assert run is not None
+        return velocity_changes(
+            path, seconds, dvl.velocity[:150], [run], np.zeros(3), 0.0
+        )[0]
+
+    before = first(np.zeros(3))
+    after = first(size * np.eye(3)[axis])
+    own = np.linalg.qr(before.B.reshape(len(before.y) * 3, -1))[0]
+    shown = (after.y - before.y).ravel()
+    said = (size * before.A[:, :, column + axis]).ravel()
+    shown, said = (values - own @ (own.T @ values) for values in (shown, said))
+    assert np.linalg.norm(shown - said) < 0.02 * np.linalg.norm(shown) + 1e-4
 
 
 RUN = simulate_mission(MissionOptions(seed=3, duration_s=200, landmarks=1))

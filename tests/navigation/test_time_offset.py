@@ -7,9 +7,11 @@ import pytest
 from scipy.linalg import block_diag
 
 from sonar_graph.navigation.alignment.time_offset import (
+    NormalEquations,
     OffsetFit,
     SampleSeries,
     fit,
+    grouped,
     search_offset,
 )
 
@@ -78,6 +80,63 @@ def test_fit_is_generalised_least_squares_with_walking_axes(walks):
     found = fit(stretches, WIDE, RATIOS)
     assert found.parameters == pytest.approx(parameters, rel=1e-6)
     assert found.covariance == pytest.approx(covariance, rel=1e-6)
+
+
+def noisy_stretch(
+    rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0
+) -> SampleSeries:
+    """Samples of sigma 0.1, a rate's white noise and its walk, with a constant as the stretch's own parameter."""
+    m = 20
+    middle = duration_s * (np.arange(m) + 0.5)
+    walk = np.linalg.cholesky(np.minimum.outer(middle, middle))
+    y = np.diff(rng.standard_normal((m + 1, 3)), axis=0)
+    y = y + np.sqrt(ratios[0] * duration_s) * rng.standard_normal((m, 3))
+    y = y + np.sqrt(ratios[1]) * duration_s * walk @ rng.standard_normal((m, 3))
+    own = duration_s * np.tile(np.eye(3), (m, 1, 1))
+    return SampleSeries(
+        0.1 * y, rng.standard_normal((m, 3, 2)), own, np.full(m, duration_s)
+    )
+
+
+def restricted_likelihood(stretches: list[SampleSeries], ratios: np.ndarray) -> float:
+    """``-2 log L`` but for a constant: Harville's formula with one dense covariance of everything."""
+    one = dense_covariance(
+        len(stretches[0].y), True, ratios, float(stretches[0].duration_s[0])
+    )
+    K = block_diag(*[one] * (3 * len(stretches)))
+    X, y = one_problem(stretches)
+    weight = np.linalg.inv(K)
+    left = y - X @ np.linalg.solve(X.T @ weight @ X, X.T @ weight @ y)
+    determinants = np.linalg.slogdet(K)[1] + np.linalg.slogdet(X.T @ weight @ X)[1]
+    return float((len(y) - X.shape[1]) * np.log(left @ weight @ left) + determinants)
+
+
+def test_the_ratios_maximise_the_restricted_likelihood():
+    rng = np.random.default_rng(3)
+    stretches = [noisy_stretch(rng, (0.8, 0.3), 0.5) for _ in range(4)]
+    tried = [
+        np.array(ratios) for ratios in ((0.8, 0.3), (0.2, 0.3), (0.8, 0.02), (3.0, 1.0))
+    ]
+    ours = [
+        NormalEquations.of(grouped(stretches), ratios).criterion(WIDE)
+        for ratios in tried
+    ]
+    assert np.diff(ours) == pytest.approx(
+        np.diff([restricted_likelihood(stretches, r) for r in tried]), rel=1e-6
+    )
+    stretches = [noisy_stretch(rng, (0.8, 0.3)) for _ in range(12)]
+    found = fit(stretches, WIDE).ratios
+    for step in (
+        (1.5, 1.0),
+        (1 / 1.5, 1.0),
+        (1.0, 1.5),
+        (1.0, 1 / 1.5),
+        (1.3, 1.3),
+        (1 / 1.3, 1.3),
+    ):
+        assert restricted_likelihood(stretches, found * step) > restricted_likelihood(
+            stretches, found
+        )
 
 
 T_S = np.arange(200.0)
