@@ -16,7 +16,6 @@ from sonar_graph.sonar.regions import (
     MEDIAN_TO_SIGMA,
     CandidateVerdict,
     background_of,
-    measure_regions,
 )
 
 from . import polar_images
@@ -108,26 +107,6 @@ def test_a_plate_is_one_candidate_where_geometry_says(x, y):
     )
     assert (blind.elevation_rad == 0).all()
     assert blind.elevation_sigma_rad[flat] == pytest.approx(0.244 / np.sqrt(12))
-
-
-@pytest.mark.parametrize(
-    ("roll", "pitch", "half_rad"), [(0.0, 0.0, 0.25), (0.3, 0.5, 0.9)]
-)
-def test_the_area_of_all_of_an_image_is_that_of_its_outline_on_the_floor(
-    roll, pitch, half_rad
-):
-    """By the shoelace formula."""
-    view = FloorView.from_angles(HEIGHT_M, roll, pitch)
-    azimuths = np.linspace(half_rad, -half_rad, 192)
-    labels = np.ones((192, 512), dtype=np.int32)
-    contrast = np.zeros((192, 512), dtype=np.float32)
-    area = measure_regions(contrast, labels, 1, RANGES_M, azimuths, view).area_m2[0]
-    xy = floor_xy(view, azimuths)
-    x, y = np.concatenate(
-        [xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1
-    )
-    shoelace = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
-    assert area == pytest.approx(shoelace * 192 / 191 * 512 / 511, rel=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal
 
 from sonar_graph.sonar import SonarStep
 from sonar_graph.sonar.tracker import (
@@ -151,24 +150,6 @@ def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
         found.position_cov[0], expected, atol=0.06 * found.position_cov.max()
     )
     assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
-
-
-def test_innovations_wrap_behind_the_sonar():
-    R = np.diag([1e-4, 1e-6])
-    tracks = track_at([-2.0, 1e-3, 0.0], 1e-4 * np.eye(3))
-    expected = Expected.of(tracks, R)
-    turned = np.array([[2.0, -np.pi + 5e-4]])
-    plain = np.array([[2.0, np.pi + 5e-4]])
-    density = expected.densities(turned, 9.0)[0, 0]
-    assert density == pytest.approx(
-        multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9
-    )
-    one, other = (
-        corrected(tracks, expected, z, np.array([0]), R).position_m
-        for z in (turned, plain)
-    )
-    assert one == pytest.approx(other, abs=1e-12)
-    assert one[0, 1] < 0  # on the other side of the axis
 
 
 def test_a_correction_is_that_of_the_information_form():
