@@ -27,19 +27,20 @@ endef
 demo: $(VENV)/.installed
 	$(BIN)/sonar-graph demo -o $(DEMO)
 
-# Loops are compiled before the workers start; each of them would compile them for itself.
+# Loops are compiled before the workers start; each of them would compile them for itself. Tests of a file share a worker,
+# so that what a file prepares once is prepared once.
 test: $(VENV)/.installed-tests
 	$(BIN)/python tests/compile_kernels.py
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(VENV)/.installed-tests
 	$(BIN)/python tests/compile_kernels.py
-	$(BIN)/python -m pytest -n auto -m slow
+	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
 
 # All properties with a hundred examples each instead of twenty.
 test-thorough: $(VENV)/.installed-tests
 	$(BIN)/python tests/compile_kernels.py
-	$(BIN)/python -m pytest -n auto --hypothesis-profile=thorough
+	$(BIN)/python -m pytest -n auto --dist loadfile --hypothesis-profile=thorough
 
 # Scripts are no library, and most are not run by the tests: of them only names and arguments are checked.
 SCRIPTS = $(BIN)/mypy --config-file= --check-untyped-defs --ignore-missing-imports --explicit-package-bases \

@@ -199,6 +199,10 @@ class Mounting(Section):
             gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.translation_m)
         )
 
+    def rotation_matrix(self) -> NDArray[np.float64]:
+        """body_R_sensor, shape (3, 3)."""
+        return np.asarray(self.pose().rotation().matrix())
+
 
 class ImuCalibration(Section):
     """Gyroscopes and accelerometers."""

@@ -15,7 +15,6 @@ be, or too certain of what many landmarks share.
 
 import csv
 import math
-import tomllib
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ import numpy as np
 
 from sonar_graph.calibration import UNKNOWN_HEIGHT, KnownMap
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.files import replacing, text_of
+from sonar_graph.files import parsed_toml, replacing, text_of
 from sonar_graph.measurements import FIRST_TOO_LARGE_ID
 from sonar_graph.navigation import NO_MAP
 from sonar_graph.sequence import Sequence
@@ -63,6 +62,10 @@ def read_map(path: Path) -> ReadMap:
     >>> read_map(Path("survey.csv")).map.ids
     (4,)
     """
+    if path.is_dir():
+        inside = sorted(path.rglob("map.toml"))
+        such = f", such as {inside[0]}" if inside else ""
+        raise LogError(f"{path}: expected a map as a file, not a folder{such}")
     try:
         text = text_of(path, "utf-8-sig")  # tables of spreadsheets begin with a mark
     except OSError as error:
@@ -72,10 +75,10 @@ def read_map(path: Path) -> ReadMap:
     warnings = []
     if path.suffix.lower() == ".toml":
         try:
-            values = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+            values = parsed_toml(text, path, LogError)
+        except LogError as error:
             raise LogError(
-                f"{path}: {error}; a table of a survey has a name that ends in .csv"
+                f"{error}; a table of a survey has a name that ends in .csv"
             ) from error
         known = parse(KnownMap, values, str(path), LogError)
     else:

@@ -75,7 +75,28 @@ def _is_sound(a: float, b: float, c: float, d: float) -> bool:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Block:
+class Columns:
+    """Base class of tables whose fields are columns: arrays whose first axis runs over the rows."""
+
+    def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
+        """The table with only the selected rows."""
+        return type(self)(
+            *(getattr(self, column.name)[selection] for column in fields(self))
+        )
+
+    @classmethod
+    def concatenate(cls, tables: Sequence[Self]) -> Self:
+        """One table from several, in the order given."""
+        return cls(
+            *(
+                np.concatenate([getattr(table, column.name) for table in tables])
+                for column in fields(cls)
+            )
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Block(Columns):
     """Base class of the measurements: columns, arrays whose first axis runs over the rows, with a stamp each.
 
     The constructor converts types where needed (without a copy where not). A column has in its metadata the ``shape``
@@ -160,9 +181,7 @@ class Block:
                 {name: column[selection] for name, column in vars(self).items()}
             )
             return block
-        return type(self)(
-            *(getattr(self, column.name)[selection] for column in fields(self))
-        )
+        return super().rows(selection)
 
     def between(self, after_ns: int, until_ns: int) -> Self | None:
         """The rows with ``after_ns < stamp <= until_ns``, or None without any."""
@@ -170,16 +189,6 @@ class Block:
             self.stamps_ns, [after_ns, until_ns], side="right"
         )
         return self.rows(slice(first, last)) if last > first else None
-
-    @classmethod
-    def concatenate(cls, blocks: Sequence[Self]) -> Self:
-        """One block from several, in the order given."""
-        return cls(
-            *(
-                np.concatenate([getattr(b, column.name) for b in blocks])
-                for column in fields(cls)
-            )
-        )
 
 
 @cache

@@ -245,6 +245,9 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
         return fault + choice(name, [], whose)
     fields = list(owner.section.model_fields)
     # the same name in a section below is what was probably meant
+    # a line that was pasted below a table counts in that table
+    if len(place) > 1 and name in model.model_fields:
+        return f"{fault}; a line `{name}. … = …` goes above the first table of the file, or into the table [{name}]"
     inside = [setting.name for setting in settings_of(owner.section)]
     meant = [
         _path((*owner.names, *dotted.split(".")))

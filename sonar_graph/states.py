@@ -7,7 +7,7 @@ import reprlib
 from array import array
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from html import escape
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Columns, Floats, Ints
 
 FIRST_ANONYMOUS_ID = 3_000_000_000
 """First identity given to landmarks that the recogniser has not named; identities of designs end at 2^31 - 1."""
@@ -85,7 +85,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Trajectory:
+class Trajectory(Columns):
     """Poses of the body in the world over time, with their covariances where known.
 
     Examples
@@ -258,12 +258,6 @@ class Trajectory:
             np.asarray(self.rotations().as_matrix())
             if self.has_orientation
             else np.full((len(self), 3, 3), np.nan)
-        )
-
-    def rows(self, selection: slice | Ints) -> Trajectory:
-        """The trajectory with only the selected rows."""
-        return Trajectory(
-            *(getattr(self, column.name)[selection] for column in fields(self))
         )
 
     def at(self, stamps_ns: Ints) -> Trajectory:

@@ -5,6 +5,7 @@ Scores in notebooks, pages, CSV and LaTeX show the same `Table`.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 
@@ -99,19 +100,21 @@ def absent(parts: int = 1) -> Cell:
 def text_table(
     name: str,
     title: str,
-    headings: list[str],
+    headings: Sequence[str | Column],
     rows: list[list[str]],
     *,
     numbers: bool = True,
+    sections: dict[int, str] | None = None,
 ) -> Table:
-    """A table of texts: the first column of words, the others of numbers or of words too."""
+    """A table of texts: the first column of words, the others of numbers or of words too, unless a column is given."""
     columns = [
         Column(heading, heading, is_number=numbers and k > 0)
+        if isinstance(heading, str)
+        else heading
         for k, heading in enumerate(headings)
     ]
-    return Table(
-        name, title, "", columns, [[words(text) for text in row] for row in rows]
-    )
+    cells = [[words(text) for text in row] for row in rows]
+    return Table(name, title, "", columns, cells, sections or {})
 
 
 def as_html(table: Table, *, is_sortable: bool = False) -> str:

@@ -115,9 +115,8 @@ def lane_log(lane: Lane, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def lane_recognition(lane: Lane) -> Recognition:
     """What is recognised in its images."""
-    from sonar_graph.recognition import RecognitionSession, one_by_one
+    from sonar_graph.recognition import recognise_images
 
-    session = RecognitionSession(lane.sequence)
-    for frame in one_by_one(lane.frames):
-        session.take(frame)
-    return session.finish()
+    found = recognise_images([lane.frames], lane.sequence)
+    assert found is not None
+    return found

@@ -193,7 +193,7 @@ def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
         seen = [
             frame
             for frame in one_by_one(block)
-            if motions.covers(int(frame.stamps_ns[0]))
+            if not motions.refusal(int(frame.stamps_ns[0]))
         ]
         known = []
         for frame in seen:

@@ -143,7 +143,7 @@ def sightings_of(seed: int) -> LabelledSightings:
         )
     sequence, found = simulate_basin(options), LabelledSightings(IDS)
     recogniser = Recogniser(sequence.calibration, designs_of(seed))
-    session = RecognitionSession(sequence, recogniser=recogniser, pictures=False)
+    session = RecognitionSession(sequence, recogniser)
     for block in simulate_basin_frames(options):
         truth, is_landmark = block.truth, block.truth.ids > 0
         columns = truth.range_m()[:, is_landmark], truth.azimuth_rad()[:, is_landmark]

@@ -10,7 +10,7 @@ from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.recognition.session import RecognitionSession, one_by_one
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.sonar_image.frames import FrameTruth
-from sonar_graph.sonar import RecogniserParams
+from sonar_graph.sonar import Recogniser, RecogniserParams
 from sonar_graph.sonar.bayes import IdentityParams
 
 WHOLE = 0.9
@@ -82,11 +82,13 @@ def run_basin(options: BasinOptions, rules: Sequence[str]) -> Run:
     sessions = {
         rule: RecognitionSession(
             sequence,
-            params=RecogniserParams(
-                identity=IdentityParams.model_validate({"rule": rule}),
-                independent=False,
+            Recogniser(
+                sequence.calibration,
+                params=RecogniserParams(
+                    identity=IdentityParams.model_validate({"rule": rule}),
+                    independent=False,
+                ),
             ),
-            pictures=False,
         )
         for rule in rules
     }

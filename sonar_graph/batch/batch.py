@@ -125,17 +125,15 @@ def run_suite(
     with Batch.opened(file, folder, overwrite=overwrite) as batch:
         if retry_failed:
             batch.discard_failed()
-        rows = batch.rows()
-        statuses = Counter(str(row["status"]) for row in rows.values())
+        statuses = Counter(row["status"] for row in batch.rows().values())
 
         def report() -> None:
             if progress is not None:
-                progress(
-                    statuses.total(), len(batch.runs), statuses.total() - statuses["ok"]
-                )
+                done = statuses.total()
+                progress(done, len(batch.runs), done - statuses["ok"])
 
         def count(_run: PlannedRun, outcome: RunOutcome) -> None:
-            statuses[str(outcome.row["status"])] += 1
+            statuses[outcome.row["status"]] += 1
             report()
 
         report()
@@ -174,13 +172,11 @@ class Batch:
         with result_folder(
             folder, BATCH, overwrite=overwrite, refusal=BatchError
         ) as written:
-            with contextlib.suppress(
-                OSError, ValueError
-            ):  # no suite here, or none that can be resumed
+            # no suite here, or none that can be resumed
+            with contextlib.suppress(OSError, ValueError):
                 name = tomllib.loads(text_of(folder / SUITE)).get("name")
-                if (
-                    name != file.suite.name and not overwrite
-                ):  # one that was edited but has its name goes on here
+                # one that was edited but has its name goes on here
+                if name != file.suite.name and not overwrite:
                     raise BatchError(
                         f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; "
                         "choose another folder with -o, or, where it only has a new name, give --overwrite"
@@ -196,11 +192,8 @@ class Batch:
 
     def rows(self) -> dict[str, Row]:
         """Rows of the runs that are done, by key."""
-        return {
-            run.key: row
-            for run in self.runs
-            if (row := self.store.row(run.key)) is not None
-        }
+        rows = {run.key: self.store.row(run.key) for run in self.runs}
+        return {key: row for key, row in rows.items() if row is not None}
 
     def discard_failed(self) -> None:
         """Remove runs that did not succeed, so that they are done again."""

@@ -32,6 +32,7 @@ from sonar_graph.batch.store import (
 )
 from sonar_graph.batch.supervision import Runners, perform_watched
 from sonar_graph.errors import BatchError, SonarGraphError
+from sonar_graph.files import refused
 
 CONNECT_S = 30.0
 CLOSE_S = 5.0
@@ -88,12 +89,8 @@ def keep(
     except (OSError, ImportError) as error:
         raise BatchError(f"a worker cannot do runs: {error}") from error
     assert isinstance(outcome, RunOutcome)
-    try:
+    with refused(store.folder, BatchError):
         store.write(run.key, outcome)
-    except OSError as error:
-        raise BatchError(
-            f"{store.folder}: cannot be written: {error.strerror or error}"
-        ) from error
     progress(run, outcome)
 
 

@@ -85,16 +85,10 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         raise
     except Exception as error:  # a log or a simulator may fail in any way, and the other runs still go on
         LOG.exception("run %s", run.key)
-        stage = (
-            "while judging"
-            if "estimate_s" in seconds
-            else "while reading or simulating the log"
-        )
-        row: Row = {
-            "status": "failed",
-            "reason": f"{stage}: {one_line(error)}",
-            "scored_instants": 0,
-        }
+        is_read = "estimate_s" in seconds
+        stage = "judging" if is_read else "reading or simulating the log"
+        reason = f"while {stage}: {one_line(error)}"
+        row: Row = {"status": "failed", "reason": reason, "scored_instants": 0}
         row |= _versions(describe_environment())
     else:
         # a single run can be looked at as any comparison
@@ -164,12 +158,11 @@ def measured(comparison: Comparison) -> Row:
     # over seeds only the last instants are independent
     for kind, errors in comparison.errors.get(run.estimator, {}).items():
         row["scored_instants"] = len(errors.stamps_ns)
-        for key, nees, dof in (
-            ("position", errors.nees_position, errors.position_dof),
-            ("yaw", errors.nees_yaw, 1),
-        ):
-            row[f"{kind}.nees_{key}_end"] = float(nees[-1] / dof)
-            row |= {f"{kind}.nees_{key}_dof": dof, f"{kind}.nees_{key}_end_dof": dof}
+        for key, dof in (("position", errors.position_dof), ("yaw", 1)):
+            name = f"{kind}.nees_{key}"
+            nees = getattr(errors, f"nees_{key}")
+            row |= {f"{name}_end": float(nees[-1] / dof), f"{name}_dof": dof}
+            row[f"{name}_end_dof"] = dof
     planar = row.keys() & {"landmarks.nees", "detections.nis"}
     row |= {f"{key}_dof": TWO_DIMENSIONS for key in planar}
     return {

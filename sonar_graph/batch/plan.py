@@ -7,7 +7,6 @@ not identify a checkout that was changed. Decisions: docs/design/0011-batch.md.
 import hashlib
 import itertools
 import json
-import os
 import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,10 +25,8 @@ from sonar_graph.batch.sources import (
     FILES,
     GENERATORS,
     KINDS,
-    content_hash,
-    files_below,
     fingerprint,
-    stamp_of,
+    hash_of,
 )
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import LogEntry, Place, SuiteFile
@@ -50,6 +47,11 @@ DIGITS = 16
 KEY_DIGITS = 20
 BYTECODE = "__pycache__"
 DEFAULT_VARIANT = "default"
+# options that a suite gives elsewhere, and where
+ELSEWHERE = {
+    "seed": "seeds are given as seeds = [...]",
+    "image": "recognise landmarks first, and give the log",
+}
 
 
 @dataclass(frozen=True)
@@ -219,26 +221,21 @@ def sources_of(file: SuiteFile) -> list[_Source]:
                 (*place, what),
                 f"there is no {what} {entry.kind!r}; there are: {', '.join(known)}",
             )
-        for name in {"seed", "image"} & {*entry.options, *entry.grid}:
-            reason = (
-                "seeds are given as seeds = [...]"
-                if name == "seed"
-                else "recognise landmarks first, and give the log"
-            )
-            file.refuse(
-                (*place, "options", name), f"cannot be set in a suite: {reason}"
-            )
+        for section, given in (
+            ("options", {*entry.options, *entry.grid}),
+            ("landmarks", {*(entry.landmarks or {})}),
+        ):
+            for name in given & ELSEWHERE.keys():
+                file.refuse(
+                    (*place, section, name),
+                    f"cannot be set in a suite: {ELSEWHERE[name]}",
+                )
         if not entry.seed_list():
             file.refuse(
                 (*place, "seeds"),
                 "has no seeds; give a number from 1 on, or a list of them",
             )
         if entry.landmarks is not None:
-            if "seed" in entry.landmarks:
-                file.refuse(
-                    (*place, "landmarks", "seed"),
-                    "cannot be set in a suite: seeds are given as seeds = [...]",
-                )
             _validated(file, (*place, "landmarks"), LandmarkOptions, entry.landmarks)
         for chosen in _combinations(file, place, entry.grid, entry.options, "options"):
             of_log = {} if entry.log is None else {"log": entry.log}
@@ -373,16 +370,13 @@ def source_hash(package: str) -> str:
     spec = find_spec(package)
     if spec is None:
         return ""
-    files = []
     # a namespace package has several folders, a module none
-    for folder in spec.submodule_search_locations or ():
-        for entry in files_below(folder, _is_no_source):
-            name = entry.path[len(folder) + 1 :].replace(os.sep, "/")
-            files.append((name, entry.path, stamp_of(entry)))
-    module = Path(spec.origin or "")
-    if not spec.submodule_search_locations and module.is_file():
-        files.append((module.name, str(module), stamp_of(module)))
-    return content_hash(tuple(sorted(files)))[:DIGITS] if files else ""
+    places = spec.submodule_search_locations or filter(None, [spec.origin])
+    return "-".join(
+        hash_of(Path(place), _is_no_source)[:DIGITS]
+        for place in places
+        if Path(place).exists()
+    )
 
 
 def _is_no_source(name: str) -> bool:

@@ -242,17 +242,16 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
         raise EvaluationError(
             f"{path}: no column {', '.join(absent)}; expected results that bench wrote"
         )
-    if not table.num_rows:
+    rows = table.to_pylist()
+    if not rows:
         raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
-    if repeated := [
-        key for key, count in Counter(table["key"].to_pylist()).items() if count > 1
-    ]:
+    # the most frequent one first
+    key, count = Counter(row["key"] for row in rows).most_common()[0]
+    if count > 1:
         raise EvaluationError(
-            f"{path}: run {repeated[0]} has more than one row; run bench again, it resumes"
+            f"{path}: run {key} has more than one row; run bench again, it resumes"
         )
-    planned = [
-        _recorded(row, place, folder) for place, row in enumerate(table.to_pylist())
-    ]
+    planned = [_recorded(row, place, folder) for place, row in enumerate(rows)]
     runs = [run for run in planned if run.status != NOT_RUN]
     if not runs:
         raise EvaluationError(
@@ -295,7 +294,7 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
     elif not (
         row.get("log_file") and (folder / row["log_file"]).is_file()
     ):  # its folder was moved or removed
-        row = row | {"log_file": None}
+        row["log_file"] = None
     fields: dict[str, Any] = {name: str(row.pop(name, None) or "") for name in FIELDS}
     seed = row.pop("seed", None)
     texts = {

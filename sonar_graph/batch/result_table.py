@@ -14,14 +14,10 @@ from pathlib import Path
 from sonar_graph.batch.recorded import RESULTS, SUITE_METADATA
 from sonar_graph.batch.store import NOT_RUN, PlannedRun, Row, Store
 from sonar_graph.batch.suite import Suite
-from sonar_graph.evaluation import LABELS
+from sonar_graph.evaluation import DIRECTIONS, SCORES, ScoreKind, format_value
 from sonar_graph.files import replacing
 
 KINDS = ("causal", "smoothed")
-UNITS = {"m": "m", "rad": "rad", "ms": "ms", "s": "s", "mb": "MB"}
-HIGHER_IS_BETTER = {"real_time_factor"}
-NO_BETTER = {"count", "used", "refused", "unnamed"}
-INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
 # times that every run has
 TIMINGS = ("wall_s", "read_s", "estimate_s", "cpu_s")
 
@@ -36,14 +32,20 @@ class Metric:
     """Column of the results by estimate, ``Causal`` or ``Smoothed``; the key is empty for a score of neither."""
 
     @property
+    def kind(self) -> ScoreKind:
+        """The score, of either estimate; a number of another table is known by its name alone."""
+        key = next(iter(self.keys.values()))
+        return SCORES.get(key, ScoreKind(self.name, self.name, rule=""))
+
+    @property
     def label(self) -> str:
         """Name for readers."""
-        return LABELS.get(self.name, self.name)
+        return self.kind.label
 
     @property
     def unit(self) -> str:
-        """Unit of the stored value."""
-        return UNITS.get(self.name.rpartition("_")[2], "")
+        """Unit of the stored value; empty for a number."""
+        return self.kind.unit.removeprefix("1")
 
     @property
     def shown_unit(self) -> str:
@@ -55,16 +57,14 @@ class Metric:
         """Factor from the stored to the shown value."""
         return math.degrees(1) if self.unit == "rad" else 1.0
 
+    def text(self, value: float) -> str:
+        """A value as people see it; words for infinity, which stands for runs without a value."""
+        return "no value" if math.isinf(value) else format_value(value * self.factor)
+
     @property
     def direction(self) -> str:
         """Words for the better values."""
-        if self.name in INSIDE:
-            return "1 is consistent"
-        if self.name in NO_BETTER:
-            return ""
-        return (
-            "higher is better" if self.name in HIGHER_IS_BETTER else "lower is better"
-        )
+        return DIRECTIONS[self.kind.better]
 
     @property
     def is_error(self) -> bool:
@@ -72,19 +72,18 @@ class Metric:
 
         Time and memory depend on the machine and its load: they are shown, and not tested.
         """
-        return self.direction == "lower is better" and not any(
+        return self.kind.better == "lower" and not any(
             map(is_timing, self.keys.values())
         )
 
     @property
     def protocol(self) -> str:
         """Definition in a sentence."""
-        said = (
+        each = " Separately for the causal and the smoothed estimate."
+        return (
             f"{self.label}, as compare defines it in the comparison.json of each run."
+            f"{'' if '' in self.keys else each}"
         )
-        if set(self.keys) <= {""}:
-            return said
-        return f"{said} Separately for the causal and the smoothed estimate."
 
 
 def is_timing(column: str) -> bool:
@@ -106,6 +105,8 @@ def metrics_of(keys: list[str]) -> list[Metric]:
     return list(found.values())
 
 
+# fields of a planned run that are columns
+DESCRIBED = ("key", "suite", "log", "seed", "variant", "estimator", "rate_hz")
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = (
     "variant",
@@ -148,40 +149,27 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
 
     rows: list[Row] = []
     for run in runs:
-        options = (
-            run.options
-            if run.landmarks is None
-            else run.options | {"landmarks": run.landmarks}
-        )
-        described: Row = {
-            "key": run.key,
-            "suite": run.suite,
-            "log": run.log,
-            "generator": run.kind,
-            "options": json.dumps(options, sort_keys=True),
-            "asked": json.dumps(run.asked, sort_keys=True),
-            "seed": run.seed,
-            "variant": run.variant,
-            "params": json.dumps(run.params, sort_keys=True),
-            "estimator": run.estimator,
-            "rate_hz": run.rate_hz,
-            **{
-                name: number
-                for name, number in run.versions.items()
-                if name in VERSIONS
-            },
+        landmarks = {} if run.landmarks is None else {"landmarks": run.landmarks}
+        as_json = {
+            "options": run.options | landmarks,
+            "asked": run.asked,
+            "params": run.params,
         }
-        row = store.row(run.key)
-        if row is None:
-            # a batch that ends early can be read without the code that planned it
-            row = {"status": NOT_RUN, "reason": "not done when this table was written"}
-        else:
-            # versions are those that the run itself found
-            row = {
-                "log_file": store.log_file(run.key),
-                **row,
-            }
-        rows.append(described | row)
+        described: Row = {
+            **{name: getattr(run, name) for name in DESCRIBED},
+            "generator": run.kind,
+            **{name: json.dumps(one, sort_keys=True) for name, one in as_json.items()},
+            **{name: run.versions[name] for name in VERSIONS if name in run.versions},
+            "log_file": store.log_file(run.key),
+        }
+        # a batch that ends early can be read without the code that planned it
+        not_done: Row = {
+            "status": NOT_RUN,
+            "reason": "not done when this table was written",
+            "log_file": None,
+        }
+        # versions are those that the run itself found
+        rows.append(described | (store.row(run.key) or not_done))
     # scores differ from log to log; every table has all of them in one order
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
     types = COLUMNS | {

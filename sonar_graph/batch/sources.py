@@ -177,24 +177,29 @@ def with_findings(kind: str, options: dict[str, Any], sequence: Sequence) -> Seq
 def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
     """All options of a source, with hashes of the content in place of file names."""
     content = {
-        name: _hash(Path(options[name]))
+        name: hash_of(Path(options[name]))
         for name in FILES
         if options.get(name) is not None
     }
     if kind == "victoria-park":
-        content[FILE] = _hash(Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
+        content[FILE] = hash_of(Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
     return {"kind": kind, **options, **content}
 
 
-def _hash(path: Path) -> str:
+def hash_of(path: Path, is_ignored: Callable[[str], bool] = lambda _name: False) -> str:
     """SHA-256 of a file, or of all names and files below a folder; read again only if stamps changed."""
-    files = [path]
-    if path.is_dir():
-        files = sorted(Path(entry.path) for entry in files_below(str(path)))
+    # of a file the content counts, and not the name
+    if not path.is_dir():
+        return content_hash(((".", str(path), stamp_of(path)),))
     named = [
-        (file.relative_to(path).as_posix(), str(file), stamp_of(file)) for file in files
+        (
+            os.path.relpath(entry.path, path).replace(os.sep, "/"),
+            entry.path,
+            stamp_of(entry),
+        )
+        for entry in files_below(str(path), is_ignored)
     ]
-    return content_hash(tuple(named))
+    return content_hash(tuple(sorted(named)))
 
 
 @lru_cache
@@ -221,7 +226,7 @@ def stamp_of(path: Path | os.DirEntry[str]) -> Stamp:
 
 def files_below(
     folder: str,
-    is_ignored: Callable[[str], bool] = lambda _name: False,
+    is_ignored: Callable[[str], bool],
     around: tuple[str, ...] = (),
 ) -> Iterator[os.DirEntry[str]]:
     """Files below a folder, links followed as readers and imports do; a link to a folder around it is ignored.

@@ -31,6 +31,7 @@ from sonar_graph.files import (
     digest_of,
     others_in,
     read_json,
+    refused,
     remove_written,
     strict_json,
 )
@@ -126,12 +127,8 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        try:
+        with refused(folder, BatchError, "choose another folder with -o"):
             (folder / RUNS).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise BatchError(
-                f"{folder}: cannot be written: {error.strerror}; choose another folder with -o"
-            ) from error
 
     def remove_partial(self) -> None:
         """Remove what a killed batch left half written or half removed; nothing else may be writing."""

@@ -43,7 +43,7 @@ from pydantic import (
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation import SCORES
-from sonar_graph.files import text_of
+from sonar_graph.files import parsed_toml, text_of
 from sonar_graph.settings import choice, faults_in, flattened
 
 # names of tables and keys, and indices of the entries of arrays, from the top of the file
@@ -59,10 +59,6 @@ DEFAULT_METRICS = (
     "smoothed.ate_raw_m",
     "landmarks.se2_m",
     "time.update_median_ms",
-)
-# every key that a score can have
-METRICS = tuple(
-    f"{block}.{name}" for block, labels in SCORES.items() for name in labels
 )
 MOST_SEEDS = 1_000_000
 # largest integer that a column of the results can hold
@@ -111,9 +107,9 @@ class LogEntry(Section):
     @field_validator("seeds", mode="before")
     @classmethod
     def _check_seeds(cls, value: Any) -> Any:
-        seeds = (
-            value if isinstance(value, list) else [value] if value is not None else []
-        )
+        if value is None:
+            return None
+        seeds = value if isinstance(value, list) else [value]
         # a number of seeds is a number of runs, and a million is a mistake
         largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
         are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
@@ -256,11 +252,9 @@ def read_suite(path: Path) -> SuiteFile:
     """
     try:
         text = text_of(path)
-        values = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise BatchError(f"{path}: cannot be read: {error}") from error
-    except (ValueError, RecursionError) as error:
-        raise BatchError(f"{path}: not TOML: {error}") from error
+    values = parsed_toml(text, path, BatchError)
     try:
         suite = Suite.model_validate(values)
     except ValidationError as error:
@@ -268,10 +262,10 @@ def read_suite(path: Path) -> SuiteFile:
         raise BatchError(f"{path}, line {line}: {faults_in(error, Suite)}") from error
     found = SuiteFile(path, text, suite)
     for number, metric in enumerate(suite.metrics):
-        if metric not in METRICS:
+        if metric not in SCORES:
             found.refuse(
                 ("metrics", number),
-                f"there is no score {metric!r}{choice(metric, METRICS)}",
+                f"there is no score {metric!r}{choice(metric, SCORES)}",
             )
     return found
 

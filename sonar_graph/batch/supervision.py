@@ -11,6 +11,7 @@ import platform
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -21,15 +22,9 @@ from sonar_graph.errors import BatchError
 from sonar_graph.evaluation import describe_environment
 from sonar_graph.files import READY, KilledError, OwnProcess
 
-ONE_THREAD = (
-    *(
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "NUMBA_NUM_THREADS",
-    ),
-    *("VECLIB_MAXIMUM_THREADS", "TBB_NUM_THREADS"),
-)
+ONE_THREAD = dict.fromkeys(
+    (f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "TBB")), "1"
+) | {"VECLIB_MAXIMUM_THREADS": "1"}
 # fixes the order of sets of texts, and with it the last digits of sums over them
 ONE_ORDER = {"PYTHONHASHSEED": "0"}
 # longest start of a process
@@ -52,27 +47,21 @@ class Runner:
 
     def __init__(self) -> None:
         self._log = tempfile.TemporaryFile(mode="a+b")  # noqa: SIM115  it is open as long as the process runs
-        environment = dict.fromkeys(ONE_THREAD, "1") | ONE_ORDER
         self._process = OwnProcess(
-            ("-m", "sonar_graph.batch.one_run"), environment, self._log
+            ("-m", "sonar_graph.batch.one_run"), ONE_THREAD | ONE_ORDER, self._log
         )
         self._is_busy = True
         self._is_foreign = False
         self._warm: set[str] = set()
         try:
-            reason = (
-                ""
-                if self._wait(Limits(START_S)) == READY
-                else f"it was not ready after {START_S:g} s"
-            )
+            if self._wait(Limits(START_S)) != READY:
+                raise KilledError(f"it was not ready after {START_S:g} s")
         except KilledError as error:
-            reason = str(error)
-        if reason:
             said = self.log()[-2000:]
             self.end()
             raise BatchError(
-                f"no process for runs on {platform.node()}: {reason}; {said}"
-            )
+                f"no process for runs on {platform.node()}: {error}; {said}"
+            ) from error
 
     @property
     def pid(self) -> int:
@@ -126,17 +115,11 @@ class Runner:
                 self._is_busy = False
                 return answer
             if time.monotonic() > deadline:
-                return RunOutcome(
-                    {
-                        "status": "timeout",
-                        "reason": f"took longer than {limits.timeout_s:g} s",
-                    }
-                )
-            if (
-                limits.memory_mb is not None
-                and resident_mb(self.pid) > limits.memory_mb
-            ):
-                reason = f"its processes needed more than {limits.memory_mb:g} MB"
+                reason = f"took longer than {limits.timeout_s:g} s"
+                return RunOutcome({"status": "timeout", "reason": reason})
+            most_mb = limits.memory_mb
+            if most_mb is not None and resident_mb(self._process.pid) > most_mb:
+                reason = f"its processes needed more than {most_mb:g} MB"
                 return RunOutcome({"status": "memory", "reason": reason})
 
 
@@ -155,22 +138,15 @@ class Runners:
         The status in the row is ``killed``, ``timeout`` or ``memory`` where the run was ended.
         Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
         """
-        reason = ""
-        log = ""
         for _ in range(ATTEMPTS):
-            runner = self._taken()
-            try:
-                outcome = runner.perform(run, limits)
-                return replace(outcome, row=_here() | outcome.row)
-            except KilledError as error:
-                reason = str(error)
-                log = runner.log()
-            finally:
-                self._give_back(runner)
-        return RunOutcome(
-            {**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"},
-            log=log,
-        )
+            with self._runner() as runner:
+                try:
+                    outcome = runner.perform(run, limits)
+                    return replace(outcome, row=_here() | outcome.row)
+                except KilledError as error:
+                    reason = f"{error}, {ATTEMPTS} times"
+                    log = runner.log()
+        return RunOutcome(_here() | {"status": "killed", "reason": reason}, log=log)
 
     def end(self) -> None:
         """End all processes, also busy ones: threads that wait for their answers get an error."""
@@ -181,7 +157,9 @@ class Runners:
         for runner in runners:
             runner.end()
 
-    def _taken(self) -> Runner:
+    @contextlib.contextmanager
+    def _runner(self) -> Iterator[Runner]:
+        """A process that is fit for a run; kept for the next one if it still is."""
         with self._lock:
             runner = self._idle.pop() if self._idle else None
         if runner is None or not runner.is_fit():
@@ -189,20 +167,19 @@ class Runners:
         with self._lock:
             self._busy.add(runner)
             is_ended = self._is_ended
-        if is_ended:
-            self._give_back(runner)
-            raise BatchError("the batch was ended")
-        return runner
-
-    def _give_back(self, runner: Runner) -> None:
-        with self._lock:
-            self._busy.discard(runner)
-            # after a timeout the process is still busy with the run: it is ended, not kept
-            is_kept = runner.is_fit() and not self._is_ended
-            if is_kept:
-                self._idle.append(runner)
-        if not is_kept:
-            runner.end()
+        try:
+            if is_ended:
+                raise BatchError("the batch was ended")
+            yield runner
+        finally:
+            with self._lock:
+                self._busy.discard(runner)
+                # after a timeout the process is still busy with the run: it is ended, not kept
+                is_kept = runner.is_fit() and not self._is_ended
+                if is_kept:
+                    self._idle.append(runner)
+            if not is_kept:
+                runner.end()
 
 
 def _here() -> Row:

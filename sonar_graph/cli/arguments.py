@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -28,11 +28,30 @@ if TYPE_CHECKING:
 Model = TypeVar("Model", bound="Section")
 # columns of output that does not go to a terminal, so that lines stay whole
 FILE_WIDTH = 2000
+# metadata of a field: what typer shows of it
+SHOWN = "shown"
+# default of an option that must be given
+REQUIRED = Parameter.empty
+
+
+def option(meaning: str, default: Any = None, *names: str, **shown: Any) -> Any:
+    """An option: the default of a command's parameter, or of a field of a class of options.
+
+    Without names it has that of its field; ``shown``: keywords of typer.
+    """
+    made = typer.Option(..., *names, help=meaning, **shown)
+    return field(default=default, metadata={SHOWN: made})
+
+
+def argument(meaning: str, metavar: str, default: Any = REQUIRED, **checks: Any) -> Any:
+    """An argument of a command, as the default of its parameter; required unless it has a default itself."""
+    made = typer.Argument(metavar=metavar, help=meaning, **checks)
+    return field(default=default, metadata={SHOWN: made})
 
 
 def existing_file(meaning: str, metavar: str = "FILE") -> Any:
     """Option for a file that must exist."""
-    return typer.Option(metavar=metavar, exists=True, dir_okay=False, help=meaning)
+    return option(meaning, metavar=metavar, exists=True, dir_okay=False)
 
 
 LogPath = Annotated[
@@ -88,58 +107,38 @@ DesignsPath = Annotated[
 class ReadingOptions:
     """Options for reading a log; `with_options` gives them to a command."""
 
-    calibration: Annotated[
-        Path | None,
-        existing_file(
-            "TOML or JSON file, or a log, whose fields go before those of the log's own calibration and mountings."
-        ),
-    ] = None
-    map: Annotated[
-        Path | None,
-        existing_file(
-            "Map of known landmarks: a map.toml that a run has written, or a CSV table of a survey. A start that the log "
-            "does not state is found in it."
-        ),
-    ] = None
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--topic",
-            metavar="ROLE=TOPIC",
-            help="Topic for a role, where inspect says that several fit or none; may be repeated. "
-            "Roles: imu, dvl, depth, heading, positions, detections, truth, true_landmarks, sonar.",
-        ),
-    ] = None
-    log_config: Annotated[
-        Path | None,
-        existing_file(
-            "What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
-            "FILE.toml",
-        ),
-    ] = None
-    start: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Leave out what was recorded before: seconds from the log's beginning (90.5), or a date and time, "
-            "in UTC unless it says else (2026-05-01T12:30:00Z).",
-        ),
-    ] = None
-    end: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Leave out what was recorded then and later; written like --start.",
-        ),
-    ] = None
-    salvage: Annotated[
-        bool,
-        typer.Option(
-            "--salvage",
-            help="Read what is whole of a log that is damaged in its middle, "
-            "and say what is lost. One that is cut off is always read as far as it goes.",
-        ),
-    ] = False
+    calibration: Path | None = existing_file(
+        "TOML or JSON file, or a log, whose fields go before those of the log's own calibration and mountings."
+    )
+    map: Path | None = existing_file(
+        "Map of known landmarks: a map.toml that a run has written, or a CSV table of a survey. A start that the log "
+        "does not state is found in it."
+    )
+    topics: list[str] | None = option(
+        "Topic for a role, where inspect says that several fit or none; may be repeated. "
+        "Roles: imu, dvl, depth, heading, positions, detections, truth, true_landmarks, sonar.",
+        None,
+        "--topic",
+        metavar="ROLE=TOPIC",
+    )
+    log_config: Path | None = existing_file(
+        "What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
+        "FILE.toml",
+    )
+    start: str | None = option(
+        "Leave out what was recorded before: seconds from the log's beginning (90.5), or a date and time, "
+        "in UTC unless it says else (2026-05-01T12:30:00Z).",
+        metavar="TIME",
+    )
+    end: str | None = option(
+        "Leave out what was recorded then and later; written like --start.",
+        metavar="TIME",
+    )
+    salvage: bool = option(
+        "Read what is whole of a log that is damaged in its middle, "
+        "and say what is lost. One that is cut off is always read as far as it goes.",
+        False,
+    )
 
     @property
     def choices(self) -> dict[str, str]:
@@ -215,7 +214,8 @@ def with_options(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Replace each dataclass among a command's parameters by its fields, which typer turns into options.
 
-    The command does not offer the fields that are left out; they have their defaults.
+    The command does not offer the fields that are left out; they have their defaults. A command from which this has
+    left fields out stays as it is when `add_commands` adds it.
     """
 
     def expand(command: Callable[..., None]) -> Callable[..., None]:
@@ -233,23 +233,35 @@ def with_options(
                 values[name] = kind(**{key: values.pop(key) for key in given})
             command(**values)
 
-        parameters = []
-        for name, parameter in signature(command).parameters.items():
-            offered = [(name, parameter.default, hints[name])]
-            if name in groups:
-                kinds = get_type_hints(groups[name], include_extras=True)
-                shown = [f for f in fields(groups[name]) if f.name not in left_out]
-                offered = [(f.name, f.default, kinds[f.name]) for f in shown]
-            parameters += [
-                Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-                for key, default, kind in offered
+        offered: list[Parameter] = []
+        for name, own in signature(command).parameters.items():
+            if name not in groups:
+                offered.append(_offered(name, hints[name], own.default))
+                continue
+            kinds = get_type_hints(groups[name], include_extras=True)
+            offered += [
+                _offered(f.name, kinds[f.name], f)
+                for f in fields(groups[name])
+                if f.name not in left_out
             ]
         # typer must see the options, and `wraps` has copied the command's own signature
-        run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        run.__signature__ = Signature(offered)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in offered}
         return run
 
     return expand
+
+
+def _offered(name: str, kind: Any, default: Any) -> Parameter:
+    """The parameter that typer sees, of a field of options or of a default that `option` or `argument` made."""
+    if isinstance(default, Field):
+        if shown := default.metadata.get(SHOWN):
+            # else typer would offer the opposite of a flag too
+            if kind is bool and not shown.param_decls:
+                shown.param_decls = (f"--{name.replace('_', '-')}",)
+            kind = Annotated[kind, shown]
+        default = default.default
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:
@@ -326,6 +338,18 @@ def validated(kind: type[Model], values: dict[str, Any], whose: str) -> Model:
 def examples(*commands: str) -> str:
     """Commands to copy, for the end of a help page; an empty line keeps each on a line of its own."""
     return "\n\n".join(["Examples:", *commands])
+
+
+def add_commands(
+    app: typer.Typer, start: str, commands: dict[Callable[..., None], list[str]]
+) -> None:
+    """Add commands in the order of the help, each with what follows its name in examples.
+
+    ``start``: what stands before the name.
+    """
+    for command, lines in commands.items():
+        shown = (f"{start} {command.__name__} {line}".rstrip() for line in lines)
+        app.command(epilog=examples(*shown))(with_options()(command))
 
 
 def printable(text: str) -> str:

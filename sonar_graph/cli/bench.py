@@ -6,11 +6,17 @@ import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from sonar_graph.cli.arguments import OutputFolder, Overwrite, echo, with_options
+from sonar_graph.cli.arguments import (
+    OutputFolder,
+    Overwrite,
+    argument,
+    echo,
+    option,
+)
 from sonar_graph.cli.outputs import progress_bars, working
 from sonar_graph.files import INTERRUPTED
 
@@ -24,37 +30,24 @@ MOST_REASONS = 5
 class BenchOptions:
     """Options for where the runs of a suite are done."""
 
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes on this machine. Default: one a core."),
-    ] = None
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead.",
-        ),
-    ] = None
-    retry_failed: Annotated[
-        bool,
-        typer.Option(
-            "--retry-failed", help="Do runs anew that failed, timed out or were killed."
-        ),
-    ] = False
+    workers: int | None = option(
+        "Processes on this machine. Default: one a core.", min=1
+    )
+    scheduler: str | None = option(
+        "A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead.",
+        metavar="ADDRESS",
+    )
+    retry_failed: bool = option(
+        "Do runs anew that failed, timed out or were killed.", False
+    )
     overwrite: Overwrite = False
 
 
-@with_options()
 def bench(
-    suite: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SUITE.toml",
-            exists=True,
-            dir_okay=False,
-            help="What is run: see benchmarks/suites.",
-        ),
-    ],
+    suite: Path = argument(
+        "What is run: see benchmarks/suites.", "SUITE.toml", exists=True, dir_okay=False
+    ),
+    *,
     output: OutputFolder,
     options: BenchOptions,
 ) -> None:
@@ -70,22 +63,10 @@ def bench(
         with progress_bars() as show:
 
             def progress(done: int, planned: int, failed: int) -> None:
-                show(
-                    "runs",
-                    done,
-                    planned,
-                    f"{done}/{planned}{f', {failed} failed' if failed else ''}",
-                )
+                remark = f"{done}/{planned}" + (f", {failed} failed" if failed else "")
+                show("runs", done, planned, remark)
 
-            batch = run_suite(
-                suite,
-                output,
-                workers=options.workers,
-                scheduler=options.scheduler,
-                retry_failed=options.retry_failed,
-                overwrite=options.overwrite,
-                progress=progress,
-            )
+            batch = run_suite(suite, output, **vars(options), progress=progress)
     except KeyboardInterrupt as error:
         echo(f"sonar-graph: interrupted; {error}".rstrip("; "), err=True)
         # the ordinary way waits for threads, also for those of workers that are gone

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
@@ -22,9 +22,10 @@ from sonar_graph.cli.arguments import (
     RateHz,
     ReadingOptions,
     answers,
+    argument,
     echo,
     estimator_settings,
-    with_options,
+    option,
 )
 from sonar_graph.cli.bench import write_report_of
 from sonar_graph.cli.outputs import (
@@ -76,15 +77,12 @@ class EstimationOptions:
     overwrite: Overwrite = False
 
 
-@with_options()
 def run(
     log: LogPath,
     output: OutputFolder,
     reading: ReadingOptions,
+    estimator: str = option("Name of an installed estimator.", "isam2"),
     *,
-    estimator: Annotated[
-        str, typer.Option("--estimator", help="Name of an installed estimator.")
-    ] = "isam2",
     estimation: EstimationOptions,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
@@ -102,16 +100,15 @@ def run(
     print_outcome(comparison, f"Results: {output}")
 
 
-@with_options()
 def compare(
     log: LogPath,
     output: OutputFolder,
     recognition: RecogniserOptions,
     reading: ReadingOptions,
+    estimators: str = option(
+        "Names of installed estimators, with commas.", DEFAULT_ESTIMATORS
+    ),
     *,
-    estimators: Annotated[
-        str, typer.Option(help="Names of installed estimators, with commas.")
-    ] = DEFAULT_ESTIMATORS,
     estimation: EstimationOptions,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
@@ -134,15 +131,9 @@ def compare(
 
 
 def report(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR",
-            exists=True,
-            file_okay=False,
-            help="Folder that compare or bench wrote.",
-        ),
-    ],
+    folder: Path = argument(
+        "Folder that compare or bench wrote.", "DIR", exists=True, file_okay=False
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Write report.html, and a batch's tables, again from what compare, run or bench left in a folder."""
@@ -162,24 +153,12 @@ def report(
 
 
 def figures(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR",
-            exists=True,
-            file_okay=False,
-            help="Folder that compare, run or bench wrote.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR",
-            help="Folder to write to. Default: DIR/paper.",
-        ),
-    ] = None,
+    folder: Path = argument(
+        "Folder that compare, run or bench wrote.", "DIR", exists=True, file_okay=False
+    ),
+    output: Path | None = option(
+        "Folder to write to. Default: DIR/paper.", None, "--output", "-o", metavar="DIR"
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Write every figure as SVG and PDF and every table as CSV, in the widths and type of journals.

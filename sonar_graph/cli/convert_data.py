@@ -11,9 +11,12 @@ import typer
 from sonar_graph.cli.arguments import (
     OutputLog,
     Overwrite,
+    add_commands,
+    argument,
     echo,
     examples,
     existing_file,
+    option,
 )
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
 from sonar_graph.errors import LogError
@@ -48,39 +51,19 @@ DATASETS = {
 }
 
 
-@datasets.command(
-    epilog=examples(
-        "sonar-graph convert csv imu.csv dvl.csv --toml > dive.toml",
-        "sonar-graph convert csv imu.csv dvl.csv --config dive.toml -o dive.mcap",
-        "sonar-graph convert csv folder_of_tables --config dive.toml -o dive.mcap",
-    )
-)
 def csv(
-    tables: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="TABLES...",
-            exists=True,
-            help="Text files, or a folder that holds them.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write."),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        existing_file(
-            "Which columns of which tables are what; --toml begins one.", "FILE.toml"
-        ),
-    ] = None,
-    toml: Annotated[
-        bool,
-        typer.Option(
-            "--toml",
-            help="Print only a guess at FILE.toml, by the names of the columns, to edit.",
-        ),
-    ] = False,
+    tables: list[Path] = argument(
+        "Text files, or a folder that holds them.", "TABLES...", exists=True
+    ),
+    output: Path | None = option(
+        "MCAP log to write.", None, "--output", "-o", metavar="OUT.mcap"
+    ),
+    config: Path | None = existing_file(
+        "Which columns of which tables are what; --toml begins one.", "FILE.toml"
+    ),
+    toml: bool = option(
+        "Print only a guess at FILE.toml, by the names of the columns, to edit.", False
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Tables of any vehicle: IMU, Doppler log, depth, heading, fixes, detections, truth; delimiters are found."""
@@ -116,34 +99,19 @@ def csv(
     echo(f"What is in it: sonar-graph inspect {output}")
 
 
-@datasets.command(
-    epilog=examples(
-        "sonar-graph convert dataset mrclam MRCLAM_Dataset6 --number 3 -o mrclam_6_3.mcap",
-        "sonar-graph convert dataset akit A-KIT --number 1 -o akit_1.mcap",
-        "sonar-graph convert dataset stpere StPereDataset -o stpere.mcap",
-        "sonar-graph convert dataset victoria-park -o victoria_park.mcap",
-    )
-)
 def dataset(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME", help="akit, dlr, mrclam, stpere or victoria-park."
-        ),
-    ],
+    name: str = argument("akit, dlr, mrclam, stpere or victoria-park.", "NAME"),
+    *,
     output: OutputLog,
-    folder: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[FOLDER]",
-            exists=True,
-            help="Folder of the data set; victoria-park comes with gtsam.",
-        ),
-    ] = None,
-    number: Annotated[
-        int | None,
-        typer.Option(help="Robot of mrclam (1 to 5), trajectory of akit (from 1 on)."),
-    ] = None,
+    folder: Path | None = argument(
+        "Folder of the data set; victoria-park comes with gtsam.",
+        "[FOLDER]",
+        None,
+        exists=True,
+    ),
+    number: int | None = option(
+        "Robot of mrclam (1 to 5), trajectory of akit (from 1 on)."
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """A public data set: underwater vehicles (akit, stpere), robots indoors (mrclam, dlr), a truck (victoria-park)."""
@@ -164,31 +132,20 @@ def dataset(
     _convert(lambda: read(*arguments), [folder], output, overwrite)
 
 
-@datasets.command(
-    epilog=examples(
-        "sonar-graph convert rosbag dive.bag -o dive.mcap",
-        "sonar-graph convert rosbag ros2_bag_folder -o dive.mcap",
-    )
-)
 def rosbag(
-    bag: Annotated[
-        Path,
-        typer.Argument(
-            metavar="BAG",
-            exists=True,
-            help="ROS 1 .bag, folder of a ROS 2 bag, or .mcap of ROS 1 messages.",
-        ),
-    ],
+    bag: Path = argument(
+        "ROS 1 .bag, folder of a ROS 2 bag, or .mcap of ROS 1 messages.",
+        "BAG",
+        exists=True,
+    ),
+    *,
     output: OutputLog,
-    definitions: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            exists=True,
-            file_okay=False,
-            help="Holds package/msg/Type.msg of types that the bag does not define.",
-        ),
-    ] = None,
+    definitions: Path | None = option(
+        "Holds package/msg/Type.msg of types that the bag does not define.",
+        metavar="FOLDER",
+        exists=True,
+        file_okay=False,
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Any ROS 1 bag, or ROS 2 bag of the sqlite3 kind, with all its topics."""
@@ -210,23 +167,14 @@ SonarRecording = Annotated[
 ]
 
 
-@datasets.command(
-    epilog=examples(
-        "sonar-graph convert didson dive.ddf -o dive_sonar.mcap",
-        "sonar-graph convert didson dive.ddf --sound-speed 1482 -o dive_sonar.mcap",
-    )
-)
 def didson(
     recording: SonarRecording,
     output: OutputLog,
-    sound_speed: Annotated[
-        float | None,
-        typer.Option(
-            min=1350,
-            max=1650,
-            help="Of the water, m/s; default: ranges as the sonar names them (1465 m/s).",
-        ),
-    ] = None,
+    sound_speed: float | None = option(
+        "Of the water, m/s; default: ranges as the sonar names them (1465 m/s).",
+        min=1350,
+        max=1650,
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Images of a DIDSON (.ddf, versions 3 and 4)."""
@@ -240,9 +188,6 @@ def didson(
     )
 
 
-@datasets.command(
-    epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap")
-)
 def aris(
     recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False
 ) -> None:
@@ -252,9 +197,6 @@ def aris(
     _convert_file(convert_aris, recording, output, overwrite)
 
 
-@datasets.command(
-    epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap")
-)
 def oculus(
     recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False
 ) -> None:
@@ -303,3 +245,29 @@ def _convert(
         f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}"
     )
     return sequence
+
+
+add_commands(
+    datasets,
+    "sonar-graph convert",
+    {
+        csv: [
+            "imu.csv dvl.csv --toml > dive.toml",
+            "imu.csv dvl.csv --config dive.toml -o dive.mcap",
+            "folder_of_tables --config dive.toml -o dive.mcap",
+        ],
+        dataset: [
+            "mrclam MRCLAM_Dataset6 --number 3 -o mrclam_6_3.mcap",
+            "akit A-KIT --number 1 -o akit_1.mcap",
+            "stpere StPereDataset -o stpere.mcap",
+            "victoria-park -o victoria_park.mcap",
+        ],
+        rosbag: ["dive.bag -o dive.mcap", "ros2_bag_folder -o dive.mcap"],
+        didson: [
+            "dive.ddf -o dive_sonar.mcap",
+            "dive.ddf --sound-speed 1482 -o dive_sonar.mcap",
+        ],
+        aris: ["dive.aris -o dive_sonar.mcap"],
+        oculus: ["pings.raw -o dive_sonar.mcap"],
+    },
+)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
@@ -14,7 +14,9 @@ from sonar_graph.cli.arguments import (
     LogPath,
     ReadingOptions,
     answers,
+    argument,
     echo,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import working
@@ -39,23 +41,14 @@ MOST_TOPICS = 500
 def inspect(
     log: LogPath,
     reading: ReadingOptions,
-    toml: Annotated[
-        bool,
-        typer.Option(
-            "--toml",
-            help="Print only the log configuration to start from, for --log-config.",
-        ),
-    ] = False,
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise, map): seconds.",
-        ),
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print everything as one JSON object.")
-    ] = False,
+    toml: bool = option(
+        "Print only the log configuration to start from, for --log-config.", False
+    ),
+    quick: bool = option(
+        "Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise, map): seconds.",
+        False,
+    ),
+    as_json: bool = option("Print everything as one JSON object.", False, "--json"),
 ) -> None:
     """Show what is in a log: topics, rates, gaps, which topic would be used for what and why, which sensors disagree.
 
@@ -80,7 +73,6 @@ def inspect(
         # the converter's words about a start by convention
         summary.notes.pop("log.start", None)
     findings: list[Finding] = []
-    grave: set[str] = set()
     skipped = ""
     # images alone can still be recognised
     is_usable = not (
@@ -103,41 +95,31 @@ def inspect(
                 sequence = reading.read(log)
                 is_read = True
                 findings = check_sensors(sequence, config)
-                grave = {finding.quantity for finding in findings if finding.grave}
         # the tables above are worth printing all the same
         except SonarGraphError as error:
             skipped = f"not compared: {error}"
             is_usable = is_usable and is_read
     # for programs: the same content, without the exit code changing
     if as_json:
-        content = asdict(summary) | {
+        derived = {
             "path": str(summary.path),
             "duration_s": summary.duration_s,
-        }
-        content |= {
             "obstacles": summary.obstacles,
             "sensors": [finding.plain() for finding in findings],
+            "sensors_skipped": skipped,
         }
-        echo(strict_json(content | {"sensors_skipped": skipped}))
+        echo(strict_json(asdict(summary) | derived))
     else:
-        print_summary(summary, findings, grave, skipped)
+        print_summary(summary, findings, skipped)
     if not is_usable:
         raise typer.Exit(UNUSABLE)
-    if (
-        summary.has_images_alone
-        or summary.warnings
-        or any(finding.acts for finding in findings)
-    ):
+    is_doubted = summary.warnings or any(finding.acts for finding in findings)
+    if summary.has_images_alone or is_doubted:
         raise typer.Exit(DOUBTFUL)
 
 
-def print_summary(
-    summary: LogSummary,
-    findings: list[Finding],
-    grave: set[str],
-    skipped: str,
-) -> None:
-    """Print the tables of a log, and a line for each note, finding and warning, as which ``grave`` quantities count."""
+def print_summary(summary: LogSummary, findings: list[Finding], skipped: str) -> None:
+    """Print the tables of a log, and a line for each note, finding and warning, as which grave quantities count."""
     console = answers()
 
     def say(heading: str, text: str, style: str = "bold") -> None:
@@ -164,9 +146,8 @@ def print_summary(
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
     shown = summary.topics[:MOST_TOPICS]
     for topic in shown:
-        kind = topic.type_name + (
-            f" ({topic.encoding})" if topic.encoding != "cdr" else ""
-        )
+        is_other = topic.encoding != "cdr"
+        kind = topic.type_name + f" ({topic.encoding})" * is_other
         first_s = (topic.first_stamp_ns - origin_ns) * 1e-9
         last_s = (topic.last_stamp_ns - origin_ns) * 1e-9
         topics.add_row(
@@ -200,6 +181,7 @@ def print_summary(
             say(subject, note)
     if not skipped:
         console.print("\n[bold]sensors against each other[/] (± 95 %)")
+        grave = {finding.quantity for finding in findings if finding.grave}
         for finding in findings:
             warned = "warning: " if finding.quantity in grave else ""
             style = "bold yellow" if finding.acts else "bold"
@@ -238,18 +220,10 @@ def print_summary(
 @with_options("salvage", "map")
 def calibration(
     reading: ReadingOptions,
-    log: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[LOG]",
-            exists=True,
-            help="MCAP log whose calibration and mountings count.",
-        ),
-    ] = None,
-    template: Annotated[
-        bool,
-        typer.Option("--template", help="Print all fields with units and defaults."),
-    ] = False,
+    log: Path | None = argument(
+        "MCAP log whose calibration and mountings count.", "[LOG]", None, exists=True
+    ),
+    template: bool = option("Print all fields with units and defaults.", False),
 ) -> None:
     """Print a calibration file to edit: all fields with units, meaning and defaults, and the values of a log."""
     from sonar_graph.calibration import Calibration

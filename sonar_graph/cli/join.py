@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from sonar_graph.cli.arguments import (
     OutputLog,
     Overwrite,
     ReadingOptions,
+    argument,
     echo,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import progress_bars, working, writable_log
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.images import SonarFrames
     from sonar_graph.logs.mcap import Outgoing
-    from sonar_graph.recognition import ClockOffset, PlanarStep
+    from sonar_graph.recognition import PlanarStep
     from sonar_graph.sequence import Sequence
 
 TOPIC = "/sonar/image"
@@ -47,42 +47,31 @@ class Seen:
 class JoinOptions:
     """Options for the clock offset of the images, and for the log that is written."""
 
-    offset: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
-        ),
-    ] = None
-    search: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.5,
-            max=3600.0,
-            help=f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
-        ),
-    ] = None
+    offset: float | None = option(
+        "To add to the images' stamps. Default: estimated, by what images and sensors say of the motion.",
+        metavar="SECONDS",
+    )
+    search: float | None = option(
+        f"Estimate the offset within so much of --offset, or of 0; {SEARCH_S:g} where neither is given.",
+        metavar="SECONDS",
+        min=0.5,
+        max=3600.0,
+    )
     overwrite: Overwrite = False
 
 
 @with_options("start", "end", "map")
 def join(
-    images: Annotated[
-        Path,
-        typer.Argument(
-            metavar="IMAGES",
-            exists=True,
-            dir_okay=False,
-            help="MCAP log with sonar images, as `convert` makes of a sonar's recording.",
-        ),
-    ],
-    navigation: Annotated[
-        Path,
-        typer.Argument(
-            metavar="NAV", exists=True, help="MCAP log with IMU and Doppler log."
-        ),
-    ],
+    images: Path = argument(
+        "MCAP log with sonar images, as `convert` makes of a sonar's recording.",
+        "IMAGES",
+        exists=True,
+        dir_okay=False,
+    ),
+    navigation: Path = argument(
+        "MCAP log with IMU and Doppler log.", "NAV", exists=True
+    ),
+    *,
     output: OutputLog,
     reading: ReadingOptions,
     options: JoinOptions,
@@ -116,14 +105,8 @@ def join(
     is_stated = options.offset is not None and options.search is None
     around_s = options.offset or 0.0
     search_s = options.search or SEARCH_S
-    require_overlap(
-        images,
-        navigation,
-        sequence,
-        seen,
-        around_s,
-        0.0 if is_stated else search_s,
-    )
+    within_s = 0.0 if is_stated else search_s
+    require_overlap(images, navigation, sequence, seen, around_s, within_s)
     seconds, said = offset_of(seen, sequence, around_s, search_s, is_stated=is_stated)
     shift_ns = round(seconds * NS_PER_S)
     # the notes of both files are kept apart by their prefix
@@ -180,11 +163,8 @@ def look(
         for block in read_sonar_frames(
             log, topic, salvage=salvage, refused=lambda *_: None
         ):
-            seen = (
-                seen
-                if seen.range_m
-                else replace(seen, range_m=float(block.ranges_m.mean()))
-            )
+            if not seen.range_m:
+                seen = replace(seen, range_m=float(block.ranges_m.mean()))
             for frame in one_by_one(block):
                 step = motions.add(frame)
                 seen.stamps_ns.append(int(frame.stamps_ns[0]))
@@ -224,7 +204,6 @@ def offset_of(
     """Offset in seconds, and its description."""
     from sonar_graph.recognition import estimate_offset
 
-    estimate: ClockOffset | None = None
     try:
         with working("estimating the clock offset"):
             # also where the offset is stated, so that a wrong one is noticed
@@ -234,19 +213,14 @@ def offset_of(
     except LogError as error:
         if not is_stated:
             raise
-        return (
-            around_s,
-            f"{around_s:+.3f} s, as stated; {str(error).rpartition('; ')[0]}",
-        )
-    if not is_stated:
-        return estimate.seconds, f"{estimate}"
-    is_doubted = abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s
-    warning = (
-        "; Warning: they do not agree, leave --offset out to take the images' own"
-        if is_doubted
-        else ""
-    )
-    return around_s, f"{around_s:+.3f} s, as stated; by the images {estimate}{warning}"
+        found = str(error).rpartition("; ")[0]
+    else:
+        if not is_stated:
+            return estimate.seconds, f"{estimate}"
+        found = f"by the images {estimate}"
+        if abs(estimate.seconds - around_s) > DISAGREEING * estimate.sigma_s:
+            found += "; Warning: they do not agree, leave --offset out to take the images' own"
+    return around_s, f"{around_s:+.3f} s, as stated; {found}"
 
 
 def on_the_clock(

@@ -7,16 +7,16 @@ import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from sonar_graph.cli.arguments import (
+    REQUIRED,
     DesignsPath,
     LogPath,
     Overwrite,
     ReadingOptions,
     echo,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import is_json, progress_bars, writable_file
@@ -27,42 +27,30 @@ if TYPE_CHECKING:
     from sonar_graph.devices import LandmarkDesign
     from sonar_graph.recognition import LabelDesk, Labels, LabelServer
 
-NONE = "none"
-NONE_TEXT = "none of them"
-
 
 @dataclass(frozen=True)
 class LabelOptions:
     """Options for the frames that are shown, the page and the file of the labels."""
 
     designs: DesignsPath = None
-    period: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="Shortest time between the frames that are shown.",
-        ),
-    ] = 0.5
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free."),
-    ] = 0
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Only print the address.")
-    ] = False
+    period: float = option(
+        "Shortest time between the frames that are shown.",
+        0.5,
+        metavar="SECONDS",
+        min=0.0,
+    )
+    port: int = option("Port on 127.0.0.1; 0: any that is free.", 0, min=0, max=65535)
+    no_browser: bool = option("Only print the address.", False)
     overwrite: Overwrite = False
 
 
 @with_options("map")
 def label(
     log: LogPath,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="LABELS.json", help="File of the labels."
-        ),
-    ],
+    output: Path = option(
+        "File of the labels.", REQUIRED, "--output", "-o", metavar="LABELS.json"
+    ),
+    *,
     reading: ReadingOptions,
     options: LabelOptions,
 ) -> None:
@@ -112,19 +100,18 @@ def label(
     ) as server:
         serve(server, path, labels, is_shown=not options.no_browser)
     # calibrate must read the log as it was labelled
-    repeated = {
-        "--designs": designs,
-        "--calibration": reading.calibration,
-        "--log-config": reading.log_config,
-    }
-    given = [
-        f"{name} {shlex.quote(str(value))}"
-        for name, value in repeated.items()
-        if value is not None
+    repeated = [
+        ("--labels", path),
+        ("--designs", designs),
+        ("--calibration", reading.calibration),
+        ("--log-config", reading.log_config),
+        *(("--topic", text) for text in reading.topics or []),
+        ("-o", "model.json"),
     ]
-    given += [f"--topic {shlex.quote(text)}" for text in reading.topics or []]
-    names = f"{shlex.quote(str(log))} --labels {shlex.quote(str(path))}"
-    echo(" ".join(["Next: sonar-graph calibrate", names, *given, "-o model.json"]))
+    words = [str(log)]
+    for name, value in repeated:
+        words += [] if value is None else [name, str(value)]
+    echo(f"Next: sonar-graph calibrate {shlex.join(words)}")
 
 
 def serve(server: LabelServer, path: Path, labels: Labels, *, is_shown: bool) -> None:
@@ -155,21 +142,15 @@ def page_of(
     """The page as text."""
     from sonar_graph.report import render
 
-    choices = [
-        (str(row) if row < 10 else "", str(design.id), f"{design.id}: {design.name}")
-        for row, design in enumerate(designs, 1)
-    ]
+    first_ns = desk.frames[0].stamp_ns
     content = {
         "kind": "labels",
         "name": log.name,
         "names": [path.name],
-        "file": path.name,
-        "none_text": NONE_TEXT,
         "nonce": nonce,
-        "choices": [*choices, ("0", NONE, NONE_TEXT)],
+        "designs": designs,
         "seconds": [
-            round((frame.stamp_ns - desk.frames[0].stamp_ns) * 1e-9, 3)
-            for frame in desk.frames
+            round((frame.stamp_ns - first_ns) * 1e-9, 3) for frame in desk.frames
         ],
     }
     return render("label.html", content)

@@ -19,6 +19,7 @@ from sonar_graph.cli.arguments import (
     ReadingOptions,
     echo,
     estimator_settings,
+    option,
     with_options,
 )
 from sonar_graph.cli.outputs import working
@@ -44,14 +45,11 @@ DOMAIN = Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")]
 class LinkOptions:
     """Options for where messages come from."""
 
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ENDPOINT",
-            help="zenoh router (tcp/ADDRESS:7447), as rmw_zenohd or `play` is one; or a foxglove_bridge "
-            "(ws://ADDRESS:8765), to which nothing is sent back.",
-        ),
-    ] = None
+    connect: list[str] | None = option(
+        "zenoh router (tcp/ADDRESS:7447), as rmw_zenohd or `play` is one; or a foxglove_bridge "
+        "(ws://ADDRESS:8765), to which nothing is sent back.",
+        metavar="ENDPOINT",
+    )
     domain: DOMAIN = 0
 
     @property
@@ -66,20 +64,14 @@ class LinkOptions:
 class LiveEstimation:
     """Options for the estimator of a live run and for the messages that it gets."""
 
-    estimator: Annotated[
-        str, typer.Option("--estimator", help="Name of an installed estimator.")
-    ] = "isam2"
-    rate_hz: Annotated[
-        float, typer.Option(min=0.1, max=100.0, help="Estimates a second.")
-    ] = 10.0
-    lateness: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="How long an estimate waits for a sensor that is late.",
-        ),
-    ] = 0.25
+    estimator: str = option("Name of an installed estimator.", "isam2")
+    rate_hz: float = option("Estimates a second.", 10.0, min=0.1, max=100.0)
+    lateness: float = option(
+        "How long an estimate waits for a sensor that is late.",
+        0.25,
+        metavar="SECONDS",
+        min=0.0,
+    )
     settings: EstimatorSettings = None
 
     @property
@@ -95,19 +87,13 @@ def live(
     link_options: LinkOptions,
     estimation: LiveEstimation,
     reading: ReadingOptions,
-    *,
-    foxglove: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PORT",
-            min=1,
-            max=65535,
-            help="Also serve Foxglove and Lichtblick on 127.0.0.1 (8765).",
-        ),
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="End after so long.")
-    ] = None,
+    foxglove: int | None = option(
+        "Also serve Foxglove and Lichtblick on 127.0.0.1 (8765).",
+        metavar="PORT",
+        min=1,
+        max=65535,
+    ),
+    duration: float | None = option("End after so long.", metavar="SECONDS"),
 ) -> None:
     """Estimate while the robot moves: topics of ROS 2 over zenoh in, poses and landmarks out, and a record.
 
@@ -182,16 +168,16 @@ def live(
     write_json(output / COUNTS, {"estimator": estimator, "messages": counts})
     # landmarks may have refuted a place that was found in a map
     is_lost = not len(outcome.smoothed)
+    kept = ("causal", "smoothed", "landmarks", "withheld")
+    found: dict[str, Any] = {name: getattr(outcome, name) for name in kept}
+    if is_lost:
+        found = {"reason": "; ".join(outcome.withheld)}
     result = RunResult(
         estimator,
         params or overrides,
         "failed" if is_lost else "ok",
-        "; ".join(outcome.withheld) if is_lost else "",
-        causal=None if is_lost else outcome.causal,
-        smoothed=None if is_lost else outcome.smoothed,
-        landmarks=None if is_lost else outcome.landmarks,
+        **found,
         refused=outcome.refused,
-        withheld=[] if is_lost else outcome.withheld,
         update_s=np.array(outcome.update_s),
         finish_s=outcome.finish_s,
     )
@@ -239,45 +225,32 @@ def with_map(reading: ReadingOptions) -> PartialCalibration | None:
 class PlayStart:
     """Options for when the first message is sent."""
 
-    wait: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.0,
-            help="Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
-        ),
-    ] = None
-    after: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Wait until this file is there, such as one that a script makes.",
-        ),
-    ] = None
+    wait: float | None = option(
+        "Longest time to wait for a listener, and then end; 0 sends at once. Unless given, as long as it takes.",
+        metavar="SECONDS",
+        min=0.0,
+    )
+    after: Path | None = option(
+        "Wait until this file is there, such as one that a script makes.",
+        metavar="FILE",
+    )
 
 
-@with_options()
 def play(
     log: LogPath,
-    *,
-    rate: Annotated[
-        float,
-        typer.Option(min=1e-3, max=1e3, help="Speed: 2 is twice as fast as recorded."),
-    ] = 1.0,
-    listen: Annotated[
-        str,
-        typer.Option(
-            metavar="ENDPOINT",
-            help="Where to listen as a zenoh router; loopback unless named.",
-        ),
-    ] = "tcp/127.0.0.1:7447",
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ENDPOINT", help="Router to send to, instead of listening."
-        ),
-    ] = None,
+    rate: float = option(
+        "Speed: 2 is twice as fast as recorded.", 1.0, min=1e-3, max=1e3
+    ),
+    listen: str = option(
+        "Where to listen as a zenoh router; loopback unless named.",
+        "tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+    ),
+    connect: list[str] | None = option(
+        "Router to send to, instead of listening.", metavar="ENDPOINT"
+    ),
     domain: DOMAIN = 0,
+    *,
     start: PlayStart,
 ) -> None:
     """Send the messages of a log over zenoh as a robot would, for rehearsals and tests of `live`."""

@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import examples, printable
+from sonar_graph.cli.arguments import add_commands, examples, printable
 from sonar_graph.cli.bench import bench
 from sonar_graph.cli.compare import compare, demo, estimators, figures, report, run
 from sonar_graph.cli.convert_data import datasets
@@ -48,7 +48,7 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
-EXAMPLES: dict[Callable[..., None], list[str]] = {
+COMMANDS: dict[Callable[..., None], list[str]] = {
     inspect: ["dive.mcap", "dive.mcap --toml"],
     calibration: ["--template > vehicle.toml", "--template dive.mcap > vehicle.toml"],
     run: [
@@ -85,12 +85,7 @@ EXAMPLES: dict[Callable[..., None], list[str]] = {
     estimators: [""],
     demo: ["-o demo"],
 }
-"""Commands in the order of the help, each with what follows its name in an example."""
-for command, lines in EXAMPLES.items():
-    start = f"sonar-graph {command.__name__}"
-    app.command(epilog=examples(*(f"{start} {line}".rstrip() for line in lines)))(
-        command
-    )
+add_commands(app, "sonar-graph", COMMANDS)
 
 
 def show_version(wanted: bool) -> None:

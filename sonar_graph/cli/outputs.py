@@ -3,8 +3,9 @@
 Files that the user wrote are never overwritten.
 """
 
+import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.cli.arguments import echo, printable
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
-from sonar_graph.files import COMPARISON, read_json, result_folder
+from sonar_graph.files import COMPARISON, read_json, refused, result_folder
 
 # line of every page of tracks
 OWN_PAGE = '<p class="kicker">sonar_graph recognition</p>'
@@ -123,20 +124,13 @@ def _require_writing_in(
 
     Nothing is made for that: another command may be about to write there.
     """
-    try:
-        # the only sure way to find out: rights, quotas and read-only mounts differ
-        with TemporaryFile(
-            dir=next(
-                one
-                for one in (folder, *folder.parents)
-                if one.exists() or one.is_symlink()
-            )
-        ):
-            pass
-    except OSError as error:
-        raise refusal(
-            f"{path}: cannot be written: {error.strerror}; choose another place with -o"
-        ) from error
+    existing = (one for one in (folder, *folder.parents) if os.path.lexists(one))
+    # the only sure way to find out: rights, quotas and read-only mounts differ
+    with (
+        refused(path, refusal, "choose another place with -o"),
+        TemporaryFile(dir=next(existing)),
+    ):
+        pass
 
 
 # called with the name of the work, the number of steps done, their total (0: not known), and perhaps a remark
@@ -174,8 +168,5 @@ def progress_bars() -> Iterator[Report]:
 def working(what: str) -> Iterator[None]:
     """Spinner beside ``what``, for work of unknown length."""
     console = Console(stderr=True)
-    if not console.is_terminal:
-        yield
-        return
-    with console.status(what):
+    with console.status(what) if console.is_terminal else nullcontext():
         yield

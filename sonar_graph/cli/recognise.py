@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from sonar_graph.cli.arguments import (
+    REQUIRED,
     DesignsPath,
     LogPath,
     OutputLog,
     Overwrite,
     ReadingOptions,
     answers,
+    argument,
     echo,
     existing_file,
     nested_settings,
+    option,
     validated,
     with_options,
 )
@@ -87,19 +90,12 @@ class RecogniserOptions:
     """Options for recognising landmarks by their designs."""
 
     designs: DesignsPath = None
-    model: Annotated[
-        Path | None,
-        existing_file(
-            "How often landmarks look like which, as calibrate measured it.",
-            "MODEL.json",
-        ),
-    ] = None
-    rule: Annotated[
-        str | None,
-        typer.Option(
-            help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's)."
-        ),
-    ] = None
+    model: Path | None = existing_file(
+        "How often landmarks look like which, as calibrate measured it.", "MODEL.json"
+    )
+    rule: str | None = option(
+        "How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's)."
+    )
 
     @property
     def is_given(self) -> bool:
@@ -160,13 +156,10 @@ class RecognitionChoices:
     recogniser: RecogniserName = "designs"
     motion: Motion = None
     settings: Settings = None
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PAGE.html",
-            help="Page to write: every track with picture, probabilities and fate.",
-        ),
-    ] = None
+    report: Path | None = option(
+        "Page to write: every track with picture, probabilities and fate.",
+        metavar="PAGE.html",
+    )
     overwrite: Overwrite = False
 
 
@@ -193,7 +186,7 @@ def recognise(
         write_amended,
     )
     from sonar_graph.recognition import SEE_TRACKS, TrackStories
-    from sonar_graph.report.tracks import write_track_page
+    from sonar_graph.report import write_track_page
     from sonar_graph.sonar import Recogniser
 
     path = writable_log(output, log, overwrite=options.overwrite)
@@ -277,15 +270,12 @@ def recognise(
 class CalibrateOptions:
     """Options for what the model is measured by: labels, motion, designs and settings."""
 
-    labels: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="LABELS.json",
-            exists=True,
-            dir_okay=False,
-            help="Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
-        ),
-    ] = None
+    labels: list[Path] | None = option(
+        "Labels instead of a truth, as `label` writes them or as CSV; one file for each log, in their order.",
+        metavar="LABELS.json",
+        exists=True,
+        dir_okay=False,
+    )
     motion: Motion = None
     designs: DesignsPath = None
     settings: Settings = None
@@ -294,22 +284,18 @@ class CalibrateOptions:
 
 @with_options("start", "end", "map")
 def calibrate(
-    logs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="LOG...", exists=True, help="Logs with images and truth."
-        ),
-    ],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="MODEL.json", help="File to write."),
-    ],
+    logs: list[Path] = argument("Logs with images and truth.", "LOG...", exists=True),
+    output: Path = option(
+        "File to write.", REQUIRED, "--output", "-o", metavar="MODEL.json"
+    ),
+    *,
     reading: ReadingOptions,
     options: CalibrateOptions,
 ) -> None:
     """Measure how often landmarks look like which, on logs with sonar images whose truth or labels are known."""
     from sonar_graph.recognition import LabelledLog, calibrate_by_labels, read_labels
     from sonar_graph.recognition import calibrate as measure
+    from sonar_graph.states import counted
 
     labels = options.labels
     sources = [*logs, *(labels or [])]
@@ -339,46 +325,42 @@ def calibrate(
     del how["window"]
     with working("calibrating"):
         if labels:
-            given = [
-                read_labels(file, log) for log, file in zip(logs, labels, strict=True)
-            ]
-            runs = [with_motion(log, reading, options.motion) for log in logs]
-            labelled = [
-                LabelledLog(log, run, own, file, motion)
-                for log, file, own, (run, motion) in zip(
-                    logs, labels, given, runs, strict=True
-                )
-            ]
+            # labels first: a mistake in them is found before a log is read
+            pairs = list(zip(logs, labels, strict=True))
+            given = [read_labels(file, log) for log, file in pairs]
+            labelled = []
+            for (log, file), own in zip(pairs, given, strict=True):
+                run, motion = with_motion(log, reading, options.motion)
+                labelled.append(LabelledLog(log, run, own, file, motion))
             measured = calibrate_by_labels(labelled, **how)
         else:
             measured = measure([(log, reading.read(log)) for log in logs], **how)
     with replacing(path) as partial:
         partial.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    out = answers()
     for number in range(1, len(labels or []) + 1):
-        answers().print(measured.provenance[f"labels {number}"])
+        out.print(measured.provenance[f"labels {number}"])
     # frames of one track are alike: a model of few tracks knows few views
     few = []
     for name in (*(f"landmark {i}" for i in measured.ids), "no landmark"):
         frames, tracks = (
             measured.provenance[f"{what} of {name}"] for what in ("frames", "tracks")
         )
-        answers().print(
-            f"  {name}: {frames} frame{'s'[frames == '1' :]}, {tracks} track{'s'[tracks == '1' :]}"
+        out.print(
+            f"  {name}: {counted(int(frames), 'frame')}, {counted(int(tracks), 'track')}"
         )
         few += [name] if int(tracks) < FEW_TRACKS else []
-    answers().print(
+    out.print(
         f"  range sigma {1e3 * measured.range_sigma_m:.1f} mm, across {1e3 * measured.across_sigma_m:.1f} mm, "
         f"a track is reported every {measured.report_interval_s:.1f} s"
     )
     if few:
-        answers().print(
+        out.print(
             f"Caution: fewer than {FEW_TRACKS} tracks of {', '.join(few)}: frames of one track are alike; "
             "give more logs before the model is relied on"
         )
     if assumed := measured.provenance.get("confusion matrix"):
-        answers().print(
-            f"Confusion matrix, which the rule of 2014 alone uses: {assumed}"
-        )
+        out.print(f"Confusion matrix, which the rule of 2014 alone uses: {assumed}")
     echo(f"Model: {path}")
 
 
@@ -406,8 +388,7 @@ def without_navigation(found: Recognition, asked: str = "") -> list[str]:
     from sonar_graph.recognition import NO_FLOOR
 
     motion = found.notes["detections.motion"]
-    lines = []
-    lines.append(f"motion {motion}")
+    lines = [f"motion {motion}"]
     if motion.startswith("none"):
         lines.append(
             "frames of a sonar at rest repeat their speckle, so that each track counts once"

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sonar_graph.cli.arguments import (
+    REQUIRED,
     OutputLog,
     Overwrite,
     ReadingOptions,
+    add_commands,
     echo,
     examples,
     nested_settings,
+    option,
     validated,
     with_options,
 )
@@ -32,26 +35,23 @@ Seed = Annotated[
 
 @with_options("start", "end", "salvage", "map")
 def landmarks(
-    log: Annotated[
-        Path,
-        typer.Option(
-            "--on",
-            metavar="LOG",
-            exists=True,
-            help="MCAP log with a reference trajectory.",
-        ),
-    ],
+    log: Path = option(
+        "MCAP log with a reference trajectory.",
+        REQUIRED,
+        "--on",
+        metavar="LOG",
+        exists=True,
+    ),
+    *,
     output: OutputLog,
     reading: ReadingOptions,
     seed: Seed = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Any other option of the landmarks; may be repeated.",
-        ),
-    ] = None,
+    settings: list[str] | None = option(
+        "Any other option of the landmarks; may be repeated.",
+        None,
+        "--set",
+        metavar="NAME=VALUE",
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Landmarks along a recorded run, and the detections of a sonar; IMU and DVL stay as recorded."""
@@ -96,12 +96,6 @@ worlds = typer.Typer(
         "sonar-graph simulate landmarks --on dive.mcap -o with_landmarks.mcap",
     ),
 )
-worlds.command(
-    epilog=examples(
-        "sonar-graph simulate landmarks --on dive.mcap -o with_landmarks.mcap",
-        "sonar-graph simulate landmarks --on dive.mcap -o hard.mcap --seed 7 --set wrong_id_rate=0.05",
-    )
-)(landmarks)
 
 
 @dataclass(frozen=True)
@@ -109,27 +103,18 @@ class BasinChoices:
     """Options of the basin that the command line names; --set gives any other."""
 
     seed: Seed = None
-    duration_s: Annotated[
-        float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")
-    ] = None
-    laps: Annotated[
-        int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")
-    ] = None
-    images: Annotated[
-        bool,
-        typer.Option(
-            "--images",
-            help="Record sonar images, in which landmarks are still to be found, not detections.",
-        ),
-    ] = False
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help=f"Any other option of the basin; may be repeated: {_OTHERS}.",
-        ),
-    ] = None
+    duration_s: float | None = option("Length of the run in seconds. Default: 2039.")
+    laps: int | None = option("Times round the landmarks. Default: 3.", min=1)
+    images: bool = option(
+        "Record sonar images, in which landmarks are still to be found, not detections.",
+        False,
+    )
+    settings: list[str] | None = option(
+        f"Any other option of the basin; may be repeated: {_OTHERS}.",
+        None,
+        "--set",
+        metavar="NAME=VALUE",
+    )
     overwrite: Overwrite = False
 
     def of_basin(self) -> BasinOptions:
@@ -152,17 +137,6 @@ class BasinChoices:
         return validated(BasinOptions, values | given, "basin")
 
 
-@worlds.command(
-    epilog=examples(
-        "sonar-graph simulate basin -o basin.mcap",
-        "sonar-graph simulate basin -o short.mcap --duration-s 300 --laps 1 --seed 7",
-        "sonar-graph simulate basin -o hard.mcap --set imu=mti1 --set dvl=explorer --set wrong_id_rate=0.05",
-        "sonar-graph simulate basin -o images.mcap --images --duration-s 130 --laps 1",
-        "sonar-graph simulate basin -o bare.mcap --images --set image.multipath=false --set image.stones=0",
-        "sonar-graph simulate basin -o hard.mcap --images --set image.scene=hard --set image.contrast_db=-6",
-    )
-)
-@with_options()
 def basin(
     output: OutputLog,
     options: BasinChoices,
@@ -211,3 +185,23 @@ def write_basin(path: Path, options: BasinOptions) -> None:
 
     with progress_bars() as report:
         write_log(path, simulate_basin(options), images())
+
+
+add_commands(
+    worlds,
+    "sonar-graph simulate",
+    {
+        landmarks: [
+            "--on dive.mcap -o with_landmarks.mcap",
+            "--on dive.mcap -o hard.mcap --seed 7 --set wrong_id_rate=0.05",
+        ],
+        basin: [
+            "-o basin.mcap",
+            "-o short.mcap --duration-s 300 --laps 1 --seed 7",
+            "-o hard.mcap --set imu=mti1 --set dvl=explorer --set wrong_id_rate=0.05",
+            "-o images.mcap --images --duration-s 130 --laps 1",
+            "-o bare.mcap --images --set image.multipath=false --set image.stones=0",
+            "-o hard.mcap --images --set image.scene=hard --set image.contrast_db=-6",
+        ],
+    },
+)

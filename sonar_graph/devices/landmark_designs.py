@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -38,7 +37,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.files import text_of
+from sonar_graph.files import read_toml
 from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in
 
@@ -338,12 +337,7 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
 
 def _landmark_tables(file: Path) -> list[dict[str, Any]]:
     """The ``[[landmark]]`` tables of a TOML file."""
-    try:
-        values = tomllib.loads(text_of(file))
-    except OSError as error:
-        raise CalibrationError(f"{file} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{file} is not TOML: {error}") from error
+    values = read_toml(file, CalibrationError)
     # a misspelt table would be an empty file
     if unknown := sorted(values.keys() - {"landmark"}):
         meant = (

@@ -8,7 +8,6 @@ docs/theory/sensor_check.md.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +34,7 @@ from sonar_graph.diagnosis.findings import (
     NO_NEED,
     Advice,
     Finding,
+    Findings,
     Gravity,
     contradiction,
     gravity_of,
@@ -48,7 +48,7 @@ from sonar_graph.diagnosis.findings import (
     unknown,
     unused,
 )
-from sonar_graph.diagnosis.motion_signals import STRETCH_S, BodyMotion
+from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
@@ -123,7 +123,7 @@ PRESSURES = {"kPa as Pa": 1e3, "hPa as Pa": 1e2, "dbar as Pa": 1e4, "bar as Pa":
 KNOTS = "knots of the Doppler log"
 KNOTS_LINE = f"`scale = 0.5144` under [dvl] {IN_LOG_CONFIG}"
 MINUTES = "degrees and minutes written as 12.3456"
-DEGREES = {"degrees": float(np.radians(1.0))}
+DEGREES = {"degrees": np.radians(1.0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,12 +177,15 @@ def match_rows(
     y: Values,
     reference: Callable[[Floats], Values],
     drift_sigma: float = 0.0,
-    longest_s: float = STRETCH_S,
+    slow_sigma: float = 0.0,
 ) -> Match:
     """Rows of a sensor compared with the motion; also in one piece, for the search of causes."""
-    found = match(motion.stretches(seconds, y, reference, longest_s), drift_sigma)
+    stretches = [
+        replace(part, slow_sigma=slow_sigma)
+        for part in motion.stretches(seconds, y, reference)
+    ]
     whole = motion.stretches(seconds, y, reference, np.inf)
-    return replace(found, whole=tuple(whole))
+    return replace(match(stretches, drift_sigma), whole=tuple(whole))
 
 
 def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -195,13 +198,19 @@ def depth_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     # the noise of velocities adds up to a walk of the height, which grows with the time compared
     interval_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     longest_s = max(CLIMB_S, FEWEST_DEPTHS * interval_s)
-    found = match_rows(motion, t, depth.z_m, motion.reference(height), 0.03, longest_s)
+    reference = motion.reference(height)
     ahead = motion.reference(motion.ahead_m)
     stretches = [
-        replace(part, beside=lambda t: ahead(t)[:, None]) for part in found.stretches
+        replace(
+            part,
+            slow_sigma=climb_sigma(sequence),
+            beside=lambda t: ahead(t)[:, None],
+        )
+        for part in motion.stretches(t, depth.z_m, reference, longest_s)
     ]
-    found = replace(found, stretches=tuple(stretches))
-    return found.less_certain(motion.sampling_error(motion.height_m))
+    whole = motion.stretches(t, depth.z_m, reference, np.inf)
+    found = replace(match(stretches, 0.03), whole=tuple(whole))
+    return motion.between_rows(found, motion.height_m)
 
 
 def climb_sigma(sequence: Sequence) -> float:
@@ -212,7 +221,7 @@ def climb_sigma(sequence: Sequence) -> float:
     interval_s = float(np.median(np.diff(sequence.dvl.stamps_ns))) / NS_PER_S
     duration_s = min(sequence.duration_s, CLIMB_S)
     velocity_m_s = max(sequence.calibration.dvl.velocity_sigma_m_s)
-    return velocity_m_s * float(np.sqrt(interval_s * duration_s)) / 8.0
+    return velocity_m_s * np.sqrt(interval_s * duration_s) / 8.0
 
 
 def unwrapped(yaw_rad: Floats) -> Floats:
@@ -224,7 +233,7 @@ def unwrapped(yaw_rad: Floats) -> Floats:
     five = np.lib.stride_tricks.sliding_window_view(directions, 5)  # (n, 5)
     middle = np.median(five.real, axis=1) + 1j * np.median(five.imag, axis=1)
     steady = np.unwrap(np.angle(middle))
-    return np.asarray(steady + wrap_angle(yaw_rad - steady))
+    return steady + wrap_angle(yaw_rad - steady)
 
 
 def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -234,7 +243,13 @@ def heading_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
         return None
     t = motion.since_origin(heading.stamps_ns)
     yaw_rad = unwrapped(heading.yaw_rad)
-    return match_rows(motion, t, yaw_rad, motion.turned, 0.02)
+    slow_rad = slow_heading_sigma(sequence)
+    return match_rows(motion, t, yaw_rad, motion.turned, 0.02, slow_rad)
+
+
+def slow_heading_sigma(sequence: Sequence) -> float:
+    """Error of a compass that changes as slowly as the vehicle turns, rad."""
+    return 0.1 * sequence.calibration.heading.bias_sigma_rad
 
 
 def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
@@ -242,24 +257,30 @@ def fix_match(sequence: Sequence, motion: BodyMotion) -> Match | None:
     if sequence.positions is None:
         return None
     fixes = sequence.positions
-    fixes = fixes.rows(np.flatnonzero(is_level_fix(fixes)))
+    fixes = fixes.rows(is_level_fix(fixes))
     antenna = complex(*sequence.calibration.positions.antenna_m[:2])
     path = motion.path_m + antenna * np.exp(1j * motion.yaw_rad)
     t = motion.since_origin(fixes.stamps_ns)
     level = fixes.position_m @ [1.0, 1j, 0.0]
-    found = match_rows(motion, t, level, motion.reference(path))
-    return found.less_certain(motion.sampling_error(motion.path_m))
+    slow_m = slow_fix_sigma(sequence)
+    found = match_rows(motion, t, level, motion.reference(path), slow_sigma=slow_m)
+    return motion.between_rows(found, motion.path_m)
+
+
+def slow_fix_sigma(sequence: Sequence) -> float:
+    """Error of fixes that changes as slowly as the vehicle moves, m."""
+    return 0.1 * level_sigma_m(fix_sigma_m(sequence))
 
 
 def is_level_fix(fixes: PositionFixes) -> NDArray[np.bool_]:
     """Mask of fixes whose level coordinates are measured, shape (n,)."""
-    return np.asarray(fixes.are_sound() & ~are_unmeasured(fixes)[:, :2].any(axis=1))
+    return fixes.are_sound() & ~are_unmeasured(fixes)[:, :2].any(axis=1)
 
 
 def are_unmeasured(fixes: PositionFixes) -> NDArray[np.bool_]:
     """Mask of coordinates that a fix states as not measured, shape (n, 3)."""
     variances = np.einsum("nii->ni", fixes.covariance_m2)
-    return np.asarray(variances >= 0.5 * UNMEASURED_M2)
+    return variances >= 0.5 * UNMEASURED_M2
 
 
 def sighting_match(
@@ -291,7 +312,7 @@ def range_match(changes: SightingChanges, aperture_rad: float) -> Match:
     """
     whole = changes.range
     found = replace(match([whole], find_lag=False), stretches=(whole,))
-    of_elevation = aperture_rad / float(np.sqrt(12.0)) * changes.error_by_elevation
+    of_elevation = aperture_rad / np.sqrt(12.0) * changes.error_by_elevation
     by_scale = explained(found.stretches, of_scale, 1)
     if by_scale is None or not found.gain.is_known:
         return found
@@ -299,6 +320,19 @@ def range_match(changes: SightingChanges, aperture_rad: float) -> Match:
     # where ranges change little, a scale and heights look alike: the nearer to 1 of both readings is sure
     gain = min(found.gain, beside_heights, key=lambda one: abs(one.value - 1.0))
     return replace(found, gain=gain).less_certain(of_elevation)
+
+
+def depth_sense(sequence: Sequence, config: LogConfig) -> Advice:
+    """Line for depths that run against the Doppler log; above the water they are downwards, else either may be wrong."""
+    assert sequence.depth is not None
+    cause = "it rises where the vehicle sinks by the Doppler log"
+    negated = scale_line("depth", "scale", config, -1.0)
+    if float(np.median(sequence.depth.z_m)) > HIGHEST_M:
+        return Advice(f"{cause}, above the water: depths downwards", negated)
+    return Advice(
+        f"{cause}: depths downwards, an altimeter, or the Doppler log has the wrong sense along z?",
+        f"{negated}; an altimeter is no depth: {unused('depth')}; `rotation` under [dvl] {IN_LOG_CONFIG} turns its axes",
+    )
 
 
 DEPTH = Check(
@@ -311,7 +345,7 @@ DEPTH = Check(
     causes=(PITCH, DRIFT),
     step_unit="m",
     units=LENGTHS | PRESSURES,
-    sense=lambda sequence, config: depth_sense(sequence, config),
+    sense=depth_sense,
     scaled=lambda config, gain: (
         f"{scale_line('depth', 'scale', config, gain)}; of a pressure the water's density (water_density_kg_m3)"
     ),
@@ -322,7 +356,7 @@ HEADING = Check(
     against="the gyros",
     compare=heading_match,
     sigma=lambda sequence: sequence.calibration.heading.sigma_rad,
-    slow_sigma=lambda sequence: 0.1 * sequence.calibration.heading.bias_sigma_rad,
+    slow_sigma=slow_heading_sigma,
     units=DEGREES,
     sense=lambda _, config: Advice(
         "it turns against the gyros, clockwise", other_world(config, "heading")
@@ -346,7 +380,7 @@ POSITIONS = Check(
     against="the path by gyros and Doppler log",
     compare=fix_match,
     sigma=lambda sequence: level_sigma_m(fix_sigma_m(sequence)),
-    slow_sigma=lambda sequence: 0.1 * level_sigma_m(fix_sigma_m(sequence)),
+    slow_sigma=slow_fix_sigma,
     units=LENGTHS | {"degrees": 1.1e5, MINUTES: 1 / 0.6, KNOTS: 1 / 0.5144},
     sense=lambda _, config: Advice(
         "north and east are exchanged",
@@ -369,7 +403,7 @@ POSITIONS = Check(
 SIGHTINGS = partial(Check, role="detections", against="the motion between frames")
 RANGE = SIGHTINGS(
     name="ranges to landmarks",
-    compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=True),
+    compare=partial(sighting_match, of_range=True),
     sigma=lambda sequence: sequence.calibration.sonar.range_sigma_m,
     units=LENGTHS
     | {"the way there and back": 0.5, "half of the range": 2.0, KNOTS: 1 / 0.5144},
@@ -389,7 +423,7 @@ RANGE = SIGHTINGS(
 )
 AZIMUTH = SIGHTINGS(
     name="azimuths of landmarks",
-    compare=lambda sequence, motion: sighting_match(sequence, motion, of_range=False),
+    compare=partial(sighting_match, of_range=False),
     sigma=lambda sequence: sequence.calibration.sonar.azimuth_sigma_rad,
     units=DEGREES,
     scale_key="azimuth_scale",
@@ -404,19 +438,6 @@ AZIMUTH = SIGHTINGS(
     is_angle=True,
 )
 CHECKS = (DEPTH, RANGE, AZIMUTH, HEADING, POSITIONS)
-
-
-def depth_sense(sequence: Sequence, config: LogConfig) -> Advice:
-    """Line for depths that run against the Doppler log; above the water they are downwards, else either may be wrong."""
-    assert sequence.depth is not None
-    cause = "it rises where the vehicle sinks by the Doppler log"
-    negated = scale_line("depth", "scale", config, -1.0)
-    if float(np.median(sequence.depth.z_m)) > HIGHEST_M:
-        return Advice(f"{cause}, above the water: depths downwards", negated)
-    return Advice(
-        f"{cause}: depths downwards, an altimeter, or the Doppler log has the wrong sense along z?",
-        f"{negated}; an altimeter is no depth: {unused('depth')}; `rotation` under [dvl] {IN_LOG_CONFIG} turns its axes",
-    )
 
 
 def begins_below_water(sequence: Sequence) -> bool:
@@ -450,12 +471,12 @@ def fix_sigma_m(sequence: Sequence) -> tuple[float, float, float]:
 
 def level_sigma_m(sigma_m: tuple[float, float, float]) -> float:
     """Standard deviation of a level position, both axes together."""
-    return float(np.hypot(*sigma_m[:2]))
+    return np.hypot(*sigma_m[:2])
 
 
 def findings_of(
     check: Check, found: Match, sequence: Sequence, config: LogConfig
-) -> list[Finding]:
+) -> Findings:
     """Rows of the report for a comparison: gain and lag, with cause and line where one is wrong."""
     quantity = check.quantity or f"{check.name}: change over that by {check.against}"
     if not found.gain.is_known:
@@ -465,7 +486,7 @@ def findings_of(
     sigma = check.sigma(sequence)
     size = max(1.0, abs(found.gain.value))
     by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
-    found = found.less_certain(float(np.hypot(by_slow, check.systematic)))
+    found = found.less_certain(np.hypot(by_slow, check.systematic))
     if not found.moved * size > LEAST_MOVED * sigma:
         return [Finding(quantity, replace(found.gain, reason=still))]
     gain = found.gain.limited(LARGEST_GAIN_SIGMA * size, still)
@@ -615,7 +636,7 @@ class SensorComparison:
             f"{unused(check.role)} leaves it out",
         )
 
-    def small_faults(self) -> list[Finding]:
+    def small_faults(self) -> Findings:
         """Scale and delay."""
         size = self.size
         gain = self.found.gain
@@ -716,7 +737,7 @@ def vertical_bias(
     if rows and duration_s > LEAST_BIAS_S:
         found = match(rows, find_lag=False)
         # a slow wave of the heading looks like a bias: as if all of its scatter were one in each stretch
-        slope = 2.0 * found.scatter * float(np.sqrt(len(rows))) / duration_s
+        slope = 2.0 * found.scatter * np.sqrt(len(rows)) / duration_s
         bias = replace(found.gain, sigma=max(found.gain.sigma, slope, 1e-9))
     imu = sequence.calibration.imu
     allowed = imu.gyro_bias_sigma
@@ -729,7 +750,7 @@ def vertical_bias(
     axes = of_axes or (unknown("not compared"),) * 3
     known = known_values(axes)
     # the line is in the axes of the IMU
-    body_R_imu = imu.mounting.pose().rotation().matrix()
+    body_R_imu = imu.mounting.rotation_matrix()
     more_rad_s = known - (known @ up) * up + bias.value * up
     whole = np.add(imu.gyro_bias_rad_s, more_rad_s @ body_R_imu)
     row = Finding(
@@ -792,7 +813,7 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     has_height = fixes.are_sound() & ~are_unmeasured(fixes)[:, 2]
     if not has_height.any():
         return
-    fixes = fixes.rows(np.flatnonzero(has_height))
+    fixes = fixes.rows(has_height)
     by_depth = np.interp(
         fixes.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan
     )
@@ -839,7 +860,7 @@ def start_depth_findings(sequence: Sequence) -> Iterator[Finding]:
     sensor = sequence.calibration.depth
     port = np.array(sensor.port_m)
     off_m = height_m - float(start.pose().transformFrom(port)[2])
-    sigma_m = float(np.hypot(start.position_sigma_m[2], sensor.sigma_m))
+    sigma_m = np.hypot(start.position_sigma_m[2], sensor.sigma_m)
     climbed_m = float(np.ptp(rows_m))
     beyond_m = abs(off_m) - climbed_m - ACTING_SIGMAS * sigma_m
     if beyond_m <= LEAST_FROM_START_M:
@@ -916,7 +937,7 @@ def start_heading_findings(right: Sequence, motion: BodyMotion) -> Iterator[Find
     off = off[np.isfinite(off)]
     calibration = right.calibration.heading
     sigma = np.hypot(calibration.sigma_rad, calibration.bias_sigma_rad)
-    sigma = float(np.hypot(sigma, start.rpy_sigma_rad[2]))
+    sigma = np.hypot(sigma, start.rpy_sigma_rad[2])
     error = Estimate1D(float(np.median(off)) if len(off) else 0.0, sigma)
     if not matters(error, LARGE_TURN_RAD):
         return
@@ -960,7 +981,7 @@ def heading_turn(
     vertical = vertical_bias(right, motion)
     is_biased = vertical is not None and vertical.acts
     first = "once the gyro bias is put right, which comes first, " if is_biased else ""
-    sigma = float(np.hypot(right.calibration.heading.sigma_rad, allowed))
+    sigma = np.hypot(right.calibration.heading.sigma_rad, allowed)
     large_rad = min(LARGE_TURN_RAD, GRAVE_ERROR * sigma)
     yield replace(
         row,
@@ -1013,9 +1034,8 @@ FARTHEST_ORIGIN_M = 1e5
 
 def way_m(right: Sequence, at_ns: np.ndarray) -> np.ndarray:
     """Way by the Doppler log until each instant, shape (n,), in a gap at the log's high speed."""
-    is_measured = np.isfinite(right.dvl.velocity).all(axis=1)
-    stamps_ns = right.dvl.stamps_ns[is_measured]
-    speed = np.linalg.norm(right.dvl.velocity[is_measured], axis=1)
+    stamps_ns = right.dvl.stamps_ns
+    speed = np.linalg.norm(right.dvl.velocity, axis=1)
     steps_s = np.diff(stamps_ns) / NS_PER_S
     mean_speed = (speed[1:] + speed[:-1]) / 2
     # nothing is known of a gap but how fast the vehicle goes elsewhere
@@ -1024,30 +1044,18 @@ def way_m(right: Sequence, at_ns: np.ndarray) -> np.ndarray:
     return np.interp(at_ns, stamps_ns, np.append(0.0, np.cumsum(mean_speed * steps_s)))
 
 
-class Jumps(NamedTuple):
-    """Fixes from which the one `JUMP_NS` later is farther than the vehicle moves."""
-
-    share: float
-    """Of the fixes that are compared."""
-    compared: int
-    times: float
-    """Median distance of the two over the way by the Doppler log."""
-
-
-def jumps_of(right: Sequence, fixes: PositionFixes) -> Jumps:
-    """Fixes from which the one `JUMP_NS` later is farther than the Doppler log moves.
+def jump_finding(right: Sequence, fixes: PositionFixes) -> Finding | None:
+    """Fixes from which, often, the one `JUMP_NS` later is farther than the Doppler log moves; None where few are.
 
     With l the way by the Doppler log, a displacement Δ of length d is beyond it by ``e = Δ (1 - l / d)``, and is no
     noise of the two fixes where ``eᵀ (C_i + C_j)⁻¹ e`` is above `JUMP_GATE`.
     """
-    fixes = fixes.rows(np.flatnonzero(fixes.are_sound()))
+    fixes = fixes.rows(fixes.are_sound())
     t = fixes.stamps_ns
-    dvl_ns = right.dvl.stamps_ns[np.isfinite(right.dvl.velocity).all(axis=1)]
+    dvl_ns = right.dvl.stamps_ns
     later = np.searchsorted(t, t + JUMP_NS)
     i = np.flatnonzero((later < len(t)) & (t >= dvl_ns[0]))
     i = i[t[later[i]] <= dvl_ns[-1]]
-    if not len(i):
-        return Jumps(0.0, 0, 1.0)
     j = later[i]
     at_fixes_m = way_m(right, t)
     way = at_fixes_m[j] - at_fixes_m[i]
@@ -1057,12 +1065,23 @@ def jumps_of(right: Sequence, fixes: PositionFixes) -> Jumps:
     noise = np.diag(np.square(right.calibration.positions.sigma_m))
     cov_m2 = np.where(np.isnan(fixes.covariance_m2), noise, fixes.covariance_m2)
     normalised = np.linalg.solve(cov_m2[i] + cov_m2[j], beyond[:, :, None])[:, :, 0]
-    squares = np.sum(beyond * normalised, axis=1)
-    jumps = squares > JUMP_GATE
-    times = length[jumps] / np.maximum(way[jumps], LEAST_WAY_M)
-    if not len(times):
-        return Jumps(0.0, len(i), 1.0)
-    return Jumps(float(np.mean(jumps)), len(i), float(np.median(times)))
+    jumps = np.sum(beyond * normalised, axis=1) > JUMP_GATE
+    if np.count_nonzero(jumps) < FEWEST_JUMPS:
+        return None
+    share = float(np.mean(jumps))
+    if share <= LARGEST_JUMPING_SHARE:
+        return None
+    times = np.median(length[jumps] / np.maximum(way[jumps], LEAST_WAY_M))
+    sigma = np.sqrt(share * (1 - share) / len(jumps))
+    return contradiction(
+        "position fixes: jumps",
+        cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart move {times:.3g} times as much as the vehicle by its Doppler "
+        "log, beyond their noise: worse than stated, angles, another scale, or of another thing?",
+        line=f"a larger `positions.sigma_m` {IN_CALIBRATION} where they are worse; {unused('positions')} leaves them "
+        "out",
+        estimate=Estimate1D(100 * share, 100 * sigma),
+        unit="%",
+    )
 
 
 def position_findings(
@@ -1077,21 +1096,10 @@ def position_findings(
     if rows[0].grave and "%" not in rows[0].advice:
         yield rows[0]
         return
-    share, count, times = jumps_of(right, fixes)
     # of another scale, fixes move farther than the vehicle too
     is_scaled = rows[0].acts and not rows[0].grave
-    is_often = share > LARGEST_JUMPING_SHARE and share * count >= FEWEST_JUMPS
-    if is_often and not is_scaled:
-        sigma = float(np.sqrt(share * (1 - share) / count))
-        yield contradiction(
-            "position fixes: jumps",
-            cause=f"fixes {JUMP_NS / NS_PER_S:.0f} s apart move {times:.3g} times as much as the vehicle by its Doppler "
-            "log, beyond their noise: worse than stated, angles, another scale, or of another thing?",
-            line=f"a larger `positions.sigma_m` {IN_CALIBRATION} where they are worse; {unused('positions')} leaves them "
-            "out",
-            estimate=Estimate1D(100 * share, 100 * sigma),
-            unit="%",
-        )
+    if not is_scaled and (jumps := jump_finding(right, fixes)):
+        yield jumps
         return
     if rows[0].estimate.reason.startswith("too few"):
         yield from rows
@@ -1133,7 +1141,7 @@ def led_to_fixes(
         level_sigma_m(fix_sigma_m(right)) / 2,
         level_sigma_m(start.position_sigma_m),
         float(np.median(np.abs(moved))) * start.rpy_sigma_rad[2],
-        float(np.hypot(*right.calibration.positions.antenna_m[:2])),
+        np.hypot(*right.calibration.positions.antenna_m[:2]),
     )
     return median_off, float(np.linalg.norm(parts))
 
@@ -1151,14 +1159,14 @@ def distance_finding(
     order = np.argsort(np.abs(fixes.stamps_ns - right.start_ns))[:NEAR_START]
     near = np.median(fixes.position_m[order], axis=0)
     off = near - start.position_m
-    from_origin_m = float(np.hypot(*near[:2]))
-    sigma_m = float(np.hypot(noise_m, start_m))
+    from_origin_m = np.hypot(*near[:2])
+    sigma_m = np.hypot(noise_m, start_m)
     # how far the vehicle can be from the start by then
     reach_m = float(way_m(right, fixes.stamps_ns[order]).max())
     if led := led_to_fixes(right, fixes, motion):
         off, sigma_m = led
         reach_m = FARTHEST_FROM_START_M
-    from_start_m = float(np.hypot(*off[:2]))
+    from_start_m = np.hypot(*off[:2])
     quantity = "position fixes: distance from the start"
     row = Finding(quantity, Estimate1D(from_start_m, sigma_m), "m", NO_NEED)
     if from_start_m > 5.0 * sigma_m + reach_m:

@@ -124,7 +124,7 @@ def match_axes(imu: Imu, dvl: Dvl, calibration: Calibration) -> AxesMatch | None
     g, p = max(close, key=preference)
     other = np.diag([1.0, 1.0, -1.0]) @ candidates[p]
     is_sure = not any(k == g and (candidates[j] == other).all() for k, j in close)
-    ratio = float(np.sqrt(as_read / squares[g, p]))
+    ratio = np.sqrt(as_read / squares[g, p])
     return AxesMatch(candidates[g], candidates[p], ratio, is_sure)
 
 
@@ -166,7 +166,7 @@ def other_matrix(rows: "SharedRows", near: Floats) -> AxesMatch:
     # late rows fit badly in any axes
     if as_read < OTHER_MATRIX * least or least > MOST_MISFIT * Q[0, 0]:
         return AxesMatch()
-    ratio = float(np.sqrt(as_read / least))
+    ratio = np.sqrt(as_read / least)
     identity = np.eye(3).ravel()
     scale = -float(Q[0, 1:] @ identity) / float(identity @ Q[1:, 1:] @ identity)
     of_scale = square_of(Q, scale * np.eye(3))
@@ -198,7 +198,7 @@ def turned(Q: Floats, near: Floats) -> Floats:
         return square_of(Q, Rotation.from_rotvec(rotvec).as_matrix() @ near)
 
     found = minimize(square, np.zeros(3))
-    return np.asarray(Rotation.from_rotvec(found.x).as_matrix() @ near)
+    return Rotation.from_rotvec(found.x).as_matrix() @ near
 
 
 def square_of(Q: Floats, P: Floats) -> float:
@@ -226,7 +226,7 @@ def turns_less_than_body(imu: Imu, dvl: Dvl, calibration: Calibration) -> float 
     has_level_way = second > LEAST_SECOND * first
     is_closer = of_body > WORLD_RATIO * of_world and gain > WORLD_GAIN
     if is_closer and has_level_way:
-        return float(np.sqrt(of_body / of_world))
+        return np.sqrt(of_body / of_world)
     return None
 
 
@@ -283,10 +283,10 @@ class SharedRows:
         steps = np.maximum(np.ceil(np.diff(t) / STEP_S), 1).astype(int)
         row = np.concatenate([[0], np.cumsum(steps)])
         grid_s = np.interp(np.arange(row[-1] + 1), row, t)
-        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        body_R_imu = calibration.imu.mounting.rotation_matrix()
         w = imu.angular_velocity[first] @ body_R_imu.T
         f = imu.specific_force[first] @ body_R_imu.T
-        body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+        body_R_dvl = calibration.dvl.mounting.rotation_matrix()
         return cls(
             np.diff(columns_at(grid_s, imu_s, running_integral(imu_s, w)), axis=0),
             np.diff(columns_at(grid_s, imu_s, running_integral(imu_s, f)), axis=0),

@@ -17,6 +17,7 @@ from sonar_graph.diagnosis.findings import (
     IN_LOG_CONFIG,
     Advice,
     Finding,
+    Findings,
     contradiction,
     in_degrees,
     numbers,
@@ -35,7 +36,7 @@ from sonar_graph.diagnosis.signals import (
 from sonar_graph.diagnosis.start import lacks_gravity, turned_mounting, without_bias
 from sonar_graph.diagnosis.turn_rate import residual
 from sonar_graph.errors import AlignmentError
-from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.measurements import NS_PER_S, Floats, Imu
 from sonar_graph.navigation.alignment import (
     Estimate1D,
     align_in_motion,
@@ -86,7 +87,7 @@ class Cause:
 
 def since_middle(stretch: SignalStretch) -> Values:
     """Time as a column, shape (n, 1), s."""
-    return np.asarray((stretch.seconds - stretch.seconds.mean())[:, None])
+    return (stretch.seconds - stretch.seconds.mean())[:, None]
 
 
 def of_way(stretch: SignalStretch) -> Values:
@@ -145,7 +146,7 @@ def drift_advice(q: Values, _: Calibration) -> Advice:
 
 def pitch_advice(q: Values, calibration: Calibration) -> Advice:
     """A height that changes with the way ahead: which of both is pitched, only a stated start shows."""
-    pitch_rad = float(np.arcsin(np.clip(q[0].real, -1.0, 1.0)))
+    pitch_rad = np.arcsin(np.clip(q[0].real, -1.0, 1.0))
     of_dvl = pitched_line("dvl", calibration, -pitch_rad)
     of_imu = pitched_line("imu", calibration, pitch_rad)
     return Advice(
@@ -163,8 +164,8 @@ def pitched_line(role: str, calibration: Calibration, pitch_rad: float) -> str:
 
 
 def pitched_one(
-    findings: list[Finding], off: Estimate1D, calibration: Calibration
-) -> tuple[list[Finding], bool]:
+    findings: Findings, off: Estimate1D, calibration: Calibration
+) -> tuple[Findings, bool]:
     """Findings with the line for the one that is pitched, and whether it is the IMU.
 
     ``off``: pitch at a stated start by gravity, less the stated one, rad: that of the IMU's mounting, or none.
@@ -173,7 +174,7 @@ def pitched_one(
     if found is None or not off.is_known:
         return findings, False
     # the height changes by the sine for each metre ahead
-    pitch_rad = float(np.radians(found.estimate.value))
+    pitch_rad = np.radians(found.estimate.value)
     is_imu = abs(off.value - pitch_rad) < abs(off.value)
     role = "imu" if is_imu else "dvl"
     line = pitched_line(role, calibration, pitch_rad if is_imu else -pitch_rad)
@@ -183,7 +184,7 @@ def pitched_one(
 
 def sonar_turn_advice(q: Values, calibration: Calibration) -> Advice:
     """Ranges that change as if the landmarks were seen in another direction."""
-    turn_rad = float(np.arcsin(np.clip(q[0].real, -1.0, 1.0)))
+    turn_rad = np.arcsin(np.clip(q[0].real, -1.0, 1.0))
     rpy_rad = turned_mounting(calibration.sonar.mounting, (0.0, 0.0, turn_rad))
     side = "left" if turn_rad > 0 else "right"
     return Advice(
@@ -286,6 +287,7 @@ def cause_of(
     ``most``: largest ratio of the scatter to that of the best gain and delay.
     """
     tried = [(explained_by(cause, found), cause) for cause in causes]
+    # a cause counts only where its columns surely do
     fits = [(result, cause) for result, cause in tried if result and result.is_clear]
     if not fits:
         return None
@@ -314,7 +316,11 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
     texts = list[str]()
     for whole in found.whole:
         x = turned_to(whole.y, whole.x)
-        for step in steps(whole.seconds, whole.y, x, sigma, ratio):
+        # a velocity that changes between two rows of a slow Doppler log may have changed at any time between them
+        T = found.interval_s
+        before, at, after = whole.shifted(np.array([T, 0.0, -T]))
+        doubt = np.abs(after - 2.0 * at + before)
+        for step in steps(whole.seconds, whole.y, x, sigma, ratio, doubt):
             size = np.degrees(step.size) if unit == "°" else step.size
             texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
     return " and ".join(texts[:LONGEST_LIST])
@@ -353,6 +359,7 @@ def excursion(found: Match, least: float) -> str:
         slope = np.median(rise / (middle_s[j[::every]] - middle_s[i[::every]]))
         off = usual - slope * middle_s
         off -= np.median(off)
+        # the median of deviations as a standard deviation of normal noise
         scatter = 1.4826 * float(np.median(np.abs(off)))
         is_off = np.abs(off) > max(least, EXCURSION_SCATTERS * scatter)
         if is_off.any() and is_off.mean() <= MOST_OFF:
@@ -386,6 +393,7 @@ def velocity_steps(sequence: Sequence) -> Finding | None:
     for part in np.unique(parts):
         rows = np.flatnonzero((parts == part) & (before == after))
         t = motion.seconds[rows]
+        # with gravity taken off, the forces show how the velocity changed
         by_forces = felt.impulse_m_s[rows] - running_integral(t, gravity[rows])
         # a wrong unit of velocities was found before
         found += steps(t, felt.velocity_m_s[rows], by_forces, BEST_NOISE_M_S, ratio=1.0)
@@ -439,13 +447,29 @@ def misfit_of(sequence: Sequence, begin_ns: int, step_ns: int) -> float:
     dvl = sequence.dvl.between(begin_ns - 1, end_ns)
     if imu is None or dvl is None:
         return 0.0
+    whole = until_hole(imu)
+    # a calibration states the noise of a sensor at rest, and thrusters shake it
+    sensors = calibration.imu
+    shaken = max(sensors.accel_noise_density, vibration_density(whole))
+    sensors = sensors.model_copy(update={"accel_noise_density": shaken})
     try:
-        align_in_motion(until_hole(imu), dvl, calibration)
+        align_in_motion(whole, dvl, calibration.model_copy(update={"imu": sensors}))
     except AlignmentError as error:
         return error.misfit
     except np.linalg.LinAlgError:
         pass  # the noise of the calibration is zero
     return 0.0
+
+
+def vibration_density(imu: Imu) -> float:
+    """Noise density of the specific force by its second differences, m/s²/√Hz: motion changes little in two rows."""
+    bent = np.diff(imu.specific_force, n=2, axis=0)
+    if not len(bent):
+        return 0.0
+    # the second difference of white noise has six times its variance
+    sigma = 1.4826 * np.median(np.abs(bent), axis=0) / np.sqrt(6.0)  # (3,)
+    interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
+    return float(sigma.max() * np.sqrt(interval_s))
 
 
 def turned_to(y: Values, x: Values) -> Values:

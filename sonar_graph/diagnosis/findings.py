@@ -107,6 +107,9 @@ class Finding:
         }
 
 
+Findings = list[Finding]
+
+
 def gravity_of(is_grave: bool) -> Gravity:
     """Of a finding to act on."""
     return Gravity.GRAVE if is_grave else Gravity.ACT
@@ -140,14 +143,14 @@ def judged(
     ``error``: of the value that the calibration or the log has; ``least``: error from which on results change;
     ``allowed``: sigma by which the calibration allows it.
     """
+    # a row that needs no action keeps its number, so that a user sees what was compared
     if not matters(error, least, allowed):
         return replace(row, cause=fits, consequence="", line="")
     return replace(row, gravity=gravity_of(abs(error.value) > large))
 
 
-def unknown(reason: str) -> Estimate1D:
-    """A number that is not known."""
-    return Estimate1D(np.nan, np.inf, reason)
+unknown = Estimate1D.unknown
+"""A number that is not known, for a reason."""
 
 
 def known_values(estimates: Iterable[Estimate1D]) -> Floats:
@@ -160,6 +163,7 @@ def with_interval(estimate: Estimate1D, unit: str) -> str:
     half = INTERVAL_SIGMAS * estimate.sigma
     if unit.startswith(("rad/s", "m/s")):
         return f"{estimate.value:.2g} ± {half:.1g} {unit}"
+    # two digits of the interval: further ones of the value are noise
     digits = int(np.clip(1 - np.floor(np.log10(half)), 0, 8)) if half > 0 else 3
     sign = "+" if unit else ""
     return f"{estimate.value:{sign}.{digits}f} ± {half:.{digits}f} {unit}".rstrip()
@@ -167,20 +171,21 @@ def with_interval(estimate: Estimate1D, unit: str) -> str:
 
 def in_degrees(angle: Estimate1D) -> Estimate1D:
     """An angle converted from radians."""
-    value_deg = float(np.degrees(angle.value))
-    return replace(angle, value=value_deg, sigma=float(np.degrees(angle.sigma)))
+    value_deg = np.degrees(angle.value)
+    return replace(angle, value=value_deg, sigma=np.degrees(angle.sigma))
 
 
 def matters(estimate: Estimate1D, least: float, allowed: float = 0.0) -> bool:
     """True for an estimate above a threshold and beyond `ACTING_SIGMAS`, its own and the ``allowed`` sigma together."""
-    sigma = float(np.hypot(estimate.sigma, allowed))
+    sigma = np.hypot(estimate.sigma, allowed)
     return bool(
         estimate.is_known and abs(estimate.value) > max(least, ACTING_SIGMAS * sigma)
     )
 
 
-def worst_first(findings: Iterable[Finding]) -> list[Finding]:
+def worst_first(findings: Iterable[Finding]) -> Findings:
     """Grave findings, then those to act on, then the others; each in the order in which to act."""
+    # a stable sort keeps the order in which to act
     return sorted(findings, key=lambda finding: -finding.gravity)
 
 
@@ -194,9 +199,9 @@ def notes_of(findings: Iterable[Finding]) -> dict[str, str]:
     return {subject: "; ".join(lines) for subject, lines in texts.items() if lines}
 
 
-def said_once(findings: list[Finding]) -> list[Finding]:
+def said_once(findings: Findings) -> Findings:
     """Findings that share one line: the first that acts has it, the others refer to it."""
-    shown = list[Finding]()
+    shown = Findings()
     for finding in findings:
         # a line for three axes is one line to write
         is_repeated = finding.acts and any(before.acts for before in shown)
@@ -229,6 +234,7 @@ class Advice:
 
 def scale_line(role: str, key: str, config: LogConfig, gain: float) -> str:
     """Line that divides a configured scale by a gain."""
+    # the line replaces the configured number, which the rows were read with
     scale = config.number(role, key, 1.0) / gain
     return f"`{key} = {scale:.4g}` under [{role}] {IN_LOG_CONFIG}"
 

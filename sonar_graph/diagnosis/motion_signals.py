@@ -11,13 +11,18 @@ log: rows are numbered by the part without one that they belong to, and referenc
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.diagnosis.signals import SignalStretch, Values, root_mean_square
+from sonar_graph.diagnosis.signals import (
+    Match,
+    SignalStretch,
+    Values,
+    root_mean_square,
+)
 from sonar_graph.measurements import NS_PER_S, Floats, Imu, Ints
 from sonar_graph.navigation.alignment import InertialPath, holes_before
 from sonar_graph.numerics import columns_at, running_integral
@@ -71,7 +76,7 @@ class Windows(NamedTuple):
         """Mean rates of change of a quantity, shape (n, 3); NaN for a row that is a part of its own."""
         duration_s = self.end_s - self.begin_s
         duration_s = np.where(duration_s > 0.0, duration_s, np.nan)
-        return np.asarray((at(self.end_s) - at(self.begin_s)) / duration_s[:, None])
+        return (at(self.end_s) - at(self.begin_s)) / duration_s[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +111,13 @@ class BodyMotion:
         dvl = sequence.dvl
         calibration = sequence.calibration
         imu = sequence.imu
-        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        body_R_imu = calibration.imu.mounting.rotation_matrix()
         unbiased = imu.angular_velocity - calibration.imu.gyro_bias_rad_s
         force = filled(imu.specific_force) - calibration.imu.accel_bias_m_s2
         force = force @ body_R_imu.T
         path = InertialPath.of(Imu(imu.stamps_ns, unbiased @ body_R_imu.T, force))
         t = path.since_origin(dvl.stamps_ns)  # (n,)
-        rows = path.covers(t) & np.isfinite(dvl.velocity).all(axis=1)
+        rows = path.covers(t)
         # stamps may repeat: of such rows the first counts
         rows[1:] &= np.diff(t) > 0
         t = t[rows]
@@ -186,19 +191,29 @@ class BodyMotion:
 
         return at
 
-    def sampling_error(self, values: Values) -> float:
-        """Relative error of an integral of the Doppler log that its interval T makes, for `height_m` or `path_m`.
+    def between_rows(self, found: Match, values: Values) -> Match:
+        """A comparison with an integral of the Doppler log, `height_m` or `path_m`, with the errors by its interval T.
 
         Between rows the velocity counts as linear. The integral of a sine of frequency w is too small by ``(w T)^2 / 12``;
-        ``(w T)^2`` is the ratio of second differences of the velocity and the velocity.
+        ``(w T)^2`` is the ratio of second differences of the velocity and the velocity. A velocity that changes at once
+        may do so at any time between two rows, ``T / sqrt(12)``; the fewer do, the less these errors average out.
         """
-        step = np.asarray(np.diff(values) / np.diff(self.seconds), values.dtype)
-        bent = step[2:] - 2.0 * step[1:-1] + step[:-2]
+        interval_s = float(np.median(np.diff(self.seconds)))
+        found = replace(found, interval_s=interval_s)
+        velocity = np.asarray(np.diff(values) / np.diff(self.seconds), values.dtype)
+        change = np.diff(velocity)
+        bent = np.diff(change)
         inside = self.parts[3:] == self.parts[:-3]
-        if not inside.any():
-            return 0.0
-        moved = root_mean_square([step])
-        return root_mean_square([bent[inside]]) / (12.0 * max(moved, 1e-9))
+        if not np.any(bent[inside]):
+            return found
+        squares = np.abs(bent[inside]) ** 2
+        typical = float(np.sqrt(squares.mean()))
+        scale_error = typical / (12.0 * max(root_mean_square([velocity]), 1e-9))
+        sudden = min(typical / max(root_mean_square([change]), 1e-9), 1.0)
+        count = squares.sum() ** 2 / np.sum(squares**2)
+        late_s = interval_s * sudden / np.sqrt(12.0 * count)
+        lag = replace(found.lag, sigma=float(np.hypot(found.lag.sigma, late_s)))
+        return replace(found, lag=lag).less_certain(scale_error)
 
     def part_at(self, seconds: Floats) -> Ints:
         """Part of the last row before each instant, shape (n,)."""
@@ -207,7 +222,7 @@ class BodyMotion:
 
     def since_origin(self, stamps_ns: Ints) -> Floats:
         """Seconds of stamps on this motion's axis."""
-        return np.asarray((stamps_ns - self.origin_ns) / NS_PER_S)
+        return (stamps_ns - self.origin_ns) / NS_PER_S
 
     def stretches(
         self,
@@ -260,7 +275,7 @@ def yaw_rate(path: InertialPath, t: Floats, up_in_path: Floats) -> Floats:
     up_at_imu = columns_at(path.seconds, t, up_in_path)
     up = np.einsum("nji,nj->ni", path.rotations, up_at_imu)
     along = path.rate[:, 1] * up[:, 1] + path.rate[:, 2] * up[:, 2]
-    return np.asarray(along / np.maximum(up[:, 1] ** 2 + up[:, 2] ** 2, LEAST_LEVEL))
+    return along / np.maximum(up[:, 1] ** 2 + up[:, 2] ** 2, LEAST_LEVEL)
 
 
 def felt_gravity(

@@ -7,7 +7,7 @@ docs/theory/sensor_check.md.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -59,6 +59,7 @@ from sonar_graph.diagnosis.findings import (
     IN_LOG_CONFIG,
     NO_NEED,
     Finding,
+    Findings,
     Gravity,
     contradiction,
     in_degrees,
@@ -182,9 +183,11 @@ MOST_WILD = 0.1
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 BACKWARDS = -np.eye(3)
+Corrected = tuple[Findings, Sequence]
+"""Findings, and the sequence with their faults put right."""
 
 
-def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[Finding]:
+def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> Findings:
     """Findings in the order in which to act; wrong units alone, since they spoil the rest.
 
     Parameters
@@ -216,7 +219,7 @@ def of_usable_velocities(sequence: Sequence) -> Sequence:
     whole = ~is_partial(sequence.dvl.velocity_cov)
     if not whole.any():
         return sequence
-    dvl = sequence.dvl if whole.all() else sequence.dvl.rows(np.flatnonzero(whole))
+    dvl = sequence.dvl.rows(whole)
     is_wild = are_wild(dvl.velocity)
     if 0.0 < is_wild.mean() <= MOST_WILD:
         usual_ns = dvl.stamps_ns[~is_wild]
@@ -261,7 +264,7 @@ def wild_rows(velocity: Floats) -> tuple[NDArray[np.bool_], Floats]:
         np.linalg.norm(velocity - after, axis=1),
     )
     is_alone = nearest > np.linalg.norm(after - before, axis=1)
-    return np.asarray(is_far & is_alone), np.asarray(middle)
+    return is_far & is_alone, np.asarray(middle)
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
@@ -293,131 +296,245 @@ def trusted(sequence: Sequence) -> Sequence:
     return replace(sequence, notes=notes)
 
 
-def all_findings(sequence: Sequence, config: LogConfig) -> list[Finding]:
+def all_findings(sequence: Sequence, config: LogConfig) -> Findings:
     """Each comparison after those whose faults would spoil it, of a sequence without them."""
-    if faults := wrong_units(sequence, config):
-        return faults
+    check = SensorCheck(sequence, config)
+    steps = (
+        check.find_spoilt_rows,
+        check.find_axes,
+        check.find_wrong_sensor,
+        check.compare_pair,
+        check.compare_others,
+    )
+    for step in steps:
+        if step():
+            break
+    return check.rows()
+
+
+@dataclass(eq=False)
+class SensorCheck:
+    """Findings so far, and the sequence with their faults put right; a step is True where nothing more can be compared."""
+
+    sequence: Sequence
+    config: LogConfig
+    forces: Findings = field(default_factory=list)
+    axes: Findings = field(default_factory=list)
+    tilting: Findings = field(default_factory=list)
+    """Bias of the accelerometers."""
+    of_dvl: Findings = field(default_factory=list)
+    lever: Findings = field(default_factory=list)
+    bias: Findings = field(default_factory=list)
+    by_motion: Findings = field(default_factory=list)
+    reference: Findings = field(default_factory=list)
+    others: Findings = field(default_factory=list)
+    """Map and noise."""
+    match: DvlMatch = field(init=False)
+    right: Sequence = field(init=False)
+    """The sequence as the lines on the Doppler log would make it."""
+
+    def rows(self) -> Findings:
+        """All findings in the order in which to act."""
+        of_pair = [*self.forces, *self.axes, *self.tilting, *self.of_dvl]
+        of_motion = [*self.lever, *self.bias, *self.by_motion]
+        return [*of_pair, *of_motion, *self.reference, *self.others]
+
+    def find_spoilt_rows(self) -> bool:
+        """Units, stamps, axes and resolutions that spoil every comparison."""
+        self.others = wrong_units(self.sequence, self.config)
+        if not self.others and (reason := spoilt_by(self.sequence)):
+            self.others = [Finding("sensors with each other", unknown(reason))]
+        self.others = self.others or coarse_findings(self.sequence)
+        return bool(self.others)
+
+    def find_axes(self) -> bool:
+        """Scale of the forces, and axes of all three sensors."""
+        if lacks_gravity(self.sequence):
+            # as if its owner had stated so
+            update = {"use_gravity": False}
+            calibration = self.sequence.calibration.model_copy(update=update)
+            self.sequence = replace(self.sequence, calibration=calibration)
+        self.forces, sequence = force_findings(self.sequence, self.config)
+        self.axes, self.sequence = tried_axes(sequence, self.config)
+        return any(f.estimate.reason == NO_AXES for f in self.axes)
+
+    def put_turn_right(self, quantity: str, axis: int, turn_rad: Floats) -> None:
+        """Turn IMU or Doppler log back, by a rotation vector that shows about one axis of the body."""
+        pair = TurnedPair(self.sequence, turn_rad)
+        angle = in_degrees(self.match.turn[axis])
+        self.axes.append(pair.finding(quantity, angle, TURNED))
+        self.sequence = pair.corrected()
+        self.match = match_of_pair(self.sequence)
+
+    def find_wrong_sensor(self) -> bool:
+        """Gyros or velocities that are wrong by themselves, and so no reference for others; late ones are not wrong."""
+        self.match = match_of_pair(self.sequence)
+        yaw = self.match.turn[2]
+        if matters(yaw, LARGE_TURN_RAD):
+            self.put_turn_right(YAW, 2, np.array([0.0, 0.0, yaw.value]))
+        in_time = self.sequence
+        if matters(self.match.offset, LEAST_OFFSET_S):
+            in_time = replace(in_time, dvl=shifted(in_time.dvl, self.match.offset))
+        alone = (turn_rate_finding(in_time, self.config), velocity_steps(self.sequence))
+        self.of_dvl = [finding for finding in alone if finding is not None]
+        return bool(self.of_dvl)
+
+    def compare_pair(self) -> bool:
+        """IMU and Doppler log with each other."""
+        known_rad = known_values(self.match.turn[:2])
+        axis = int(np.argmax(np.abs(known_rad)))
+        if matters(self.match.turn[axis], LEAST_LEAN_RAD):
+            self.put_turn_right(LEVEL_TURNS[axis], axis, np.append(known_rad, 0.0))
+        match = self.match
+        known = self.sequence.calibration
+        self.tilting, calibration = accel_bias_findings(match, known)
+        sequence = replace(self.sequence, calibration=calibration)
+        self.sequence = sequence
+        if match.scale.is_known and any(finding.acts for finding in self.forces):
+            # velocities cannot be compared better than the forces' own scale is known
+            sigma = np.hypot(match.scale.sigma, self.forces[0].estimate.sigma)
+            match = replace(match, scale=replace(match.scale, sigma=sigma))
+        self.of_dvl = dvl_findings(match, sequence, self.config)
+        self.right = corrected_sequence(sequence, match, self.of_dvl)
+        self.lever = lever_findings(match, calibration)
+        if any(EITHER in finding.cause for finding in self.axes):
+            self.lever = unknown_arm("IMU or Doppler log is turned")
+        elif any(f.acts for f in self.of_dvl) and (
+            names := brought_apart(sequence, self.right)
+        ):
+            self.of_dvl = [contradicted(finding, names) for finding in self.of_dvl]
+            self.lever = unknown_arm("IMU and Doppler log do not fit")
+            self.right = sequence
+        is_explained = any(f.acts for f in [*self.axes, *self.tilting, *self.of_dvl])
+        if is_explained or not (unlike := unlike_pair(self.right)):
+            return False
+        self.of_dvl.append(unlike)
+        self.lever = []
+        return True
+
+    def compare_others(self) -> bool:
+        """Bias of the gyros, and all other sensors with the motion by IMU and Doppler log."""
+        tilt = find_start_tilt(self.right)
+        right, estimates = self.find_bias(tilt)
+        self.by_motion = [
+            of_heading_alone(f, right, self.match.turn[2])
+            if f.quantity == HEADING_TURN
+            else f
+            for f in motion_findings(right, self.config, estimates)
+        ]
+        self.join_vertical_bias()
+        self.doubt_arm()
+        self.reference = list(reference_findings(right, self.config, tilt))
+        start = right.calibration.start
+        if start.states("rpy_rad"):
+            off = tilt.angle(1).minus(start.rpy_rad[1])
+            found = pitched_one(self.by_motion, off, right.calibration)
+            self.by_motion, is_imu = found
+            # a start by a pitched IMU is as wrong as its mounting
+            if is_imu:
+                self.reference = [
+                    f for f in self.reference if not f.quantity.startswith(START_TILT)
+                ]
+        # sensors that are wrong do not fit a right map either
+        if not any(finding.grave for finding in self.by_motion):
+            self.others = list(map_findings(right))
+        self.others += noise_findings(self.sequence)
+        self.explain_delays()
+        self.leave_out_consequences()
+        return False
+
+    def find_bias(self, tilt: StartTilt) -> tuple[Sequence, Estimates3D]:
+        """Rows on the bias of the gyros; the sequence with the bias that they state, and what is left of it."""
+        right = self.right
+        driven = driven_bias(self.match, self.sequence)
+        estimates, sources = surest_bias(driven, tilt)
+        imu = right.calibration.imu
+        up = UPRIGHT
+        motion = BodyMotion.of(right)
+        if motion is not None:
+            up = np.median(motion.up, axis=0)
+            vertical = vertical_bias(right, motion)
+            if vertical is not None:
+                allowed = imu.gyro_bias_sigma
+                estimates = with_vertical(estimates, vertical.estimate, up, allowed)
+        D_heading = up * right.duration_s  # (3,)
+        self.bias = bias_findings(estimates, sources, imu, D_heading)
+        return without_acting_bias(right, estimates)
+
+    def join_vertical_bias(self) -> None:
+        """Keep one row on the bias that is known, and one line for all axes."""
+        of_vertical = [f for f in self.by_motion if f.quantity == VERTICAL_BIAS]
+        if any(f.estimate.is_known for f in of_vertical):
+            self.bias = [f for f in self.bias if f.estimate.is_known or f.acts]
+        if any(f.acts for f in of_vertical):
+            self.bias = [
+                replace(f, cause=ALSO, consequence="", line="") for f in self.bias
+            ]
+
+    def doubt_arm(self) -> None:
+        """Leave the lever arm open where a pitch or delays look like one."""
+        if any(f.acts and f.quantity.endswith(PITCH.name) for f in self.by_motion):
+            self.lever = unknown_arm("IMU or Doppler log is pitched")
+        # gyros that are late against the forces look like an arm
+        angles = (HEADING.name, AZIMUTH.name)
+        if any(f.quantity.startswith(angles) for f in acting_delays(self.by_motion)):
+            self.lever = unknown_arm("gyros or other sensors are late")
+
+    def explain_delays(self) -> None:
+        """Name the sensor whose stamps are wrong, where several look late."""
+        found = by_late_imu(self.of_dvl, self.by_motion, self.config)
+        self.of_dvl, self.by_motion = found
+        of_stamps = acting_delays([self.of_dvl[0], *self.by_motion, *self.reference])
+        role = drifting_role(self.sequence)
+        if not (role and (of_stamps or self.tilting)):
+            return
+        cause = f"stamps of [{role}] drift from the times of recording, or jump"
+        line = f'`stamp = "log"` under [{role}] {IN_LOG_CONFIG}'
+        late = replace(self.of_dvl[0], cause=cause, line=line, gravity=Gravity.GRAVE)
+        self.of_dvl[0] = late
+        self.lever = unknown_arm("the stamps drift")
+        # other sensors look late as well, and forces at other times are a bias
+        self.tilting = []
+        self.by_motion = [f for f in self.by_motion if not f.quantity.endswith(DELAYS)]
+        self.reference = [f for f in self.reference if f not in of_stamps]
+
+    def leave_out_consequences(self) -> None:
+        """Leave out rows that follow from others."""
+        if any(f.grave and GYRO_SCALE in f.line for f in self.by_motion):
+            # neither forces nor velocities fit turns of a wrong scale
+            self.tilting = []
+            self.of_dvl = [
+                f for f in self.of_dvl if f.quantity != DVL_SCALE or not f.acts
+            ]
+        if any(f.quantity == YAW for f in self.axes):
+            self.of_dvl = [f for f in self.of_dvl if f.quantity != YAW or f.acts]
+
+
+def match_of_pair(sequence: Sequence) -> DvlMatch:
+    """Comparison of Doppler log and IMU in the middle of the log."""
+    return match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
+
+
+def unknown_arm(reason: str) -> Findings:
+    """The row of a lever arm that is not known."""
+    return [Finding(ARM, unknown(reason), "m")]
+
+
+def driven_bias(match: DvlMatch, sequence: Sequence) -> Estimates3D:
+    """Bias of the gyros by the whole drive."""
     if lacks_gravity(sequence):
-        # as if its owner had stated so
-        update = {"use_gravity": False}
-        calibration = sequence.calibration.model_copy(update=update)
-        sequence = replace(sequence, calibration=calibration)
-    if reason := spoilt_by(sequence):
-        return [Finding("sensors with each other", unknown(reason))]
-    if coarse := coarse_findings(sequence):
-        return coarse
-    forces, sequence = force_findings(sequence, config)
-    axes, sequence = tried_axes(sequence, config)
-    if any(finding.estimate.reason == NO_AXES for finding in axes):
-        return [*forces, *axes]
-    match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    if matters(match.turn[2], LARGE_TURN_RAD):
-        pair = TurnedPair(sequence, np.array([0.0, 0.0, match.turn[2].value]))
-        axes.append(pair.finding(YAW, in_degrees(match.turn[2]), TURNED))
-        sequence = pair.corrected()
-        match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    # gyros or velocities that are wrong by themselves are no reference for others; late ones are not wrong
-    in_time = sequence
-    if matters(match.offset, LEAST_OFFSET_S):
-        in_time = replace(sequence, dvl=shifted(sequence.dvl, match.offset))
-    alone = (turn_rate_finding(in_time, config), velocity_steps(sequence))
-    if rates := [finding for finding in alone if finding is not None]:
-        return [*forces, *axes, *rates]
-    leaning, sequence = leaning_pair(match, sequence)
-    if leaning:
-        axes += leaning
-        match = match_dvl_to_imu(*middle_rows(sequence), sequence.calibration)
-    tilting, calibration = accel_bias_findings(match, sequence.calibration)
-    axes += tilting
-    sequence = replace(sequence, calibration=calibration)
+        return (unknown(NO_GRAVITY),) * 3
     x, y, z = (
         replace(one, sigma=BIAS_SIGMA_RATIO * one.sigma) for one in match.gyro_bias
     )
-    if level_speed_m_s(sequence.dvl) < LEAST_SPEED_SIGMAS * BEST_NOISE_M_S:
+    along_xy = sequence.dvl.velocity[:, :2]
+    level_speed_m_s = np.sqrt(np.mean(np.sum(along_xy**2, axis=1)))
+    if level_speed_m_s < LEAST_SPEED_SIGMAS * BEST_NOISE_M_S:
         z = unknown("too slow for a turn to bend the path")
-    driven = (unknown(NO_GRAVITY),) * 3 if lacks_gravity(sequence) else (x, y, z)
-    if match.scale.is_known and any(finding.acts for finding in forces):
-        # velocities cannot be compared better than the forces' own scale is known
-        sigma = float(np.hypot(match.scale.sigma, forces[0].estimate.sigma))
-        match = replace(match, scale=replace(match.scale, sigma=sigma))
-    of_dvl = dvl_findings(match, sequence, config)
-    # each following check sees the log as these lines would make it
-    right = corrected_sequence(sequence, match, of_dvl)
-    lever = lever_findings(match, sequence.calibration)
-    no_arm = ""
-    if any(EITHER in finding.cause for finding in axes):
-        no_arm = "IMU or Doppler log is turned"
-    elif any(f.acts for f in of_dvl) and (names := brought_apart(sequence, right)):
-        of_dvl = [contradicted(finding, names) for finding in of_dvl]
-        no_arm = "IMU and Doppler log do not fit"
-        right = sequence
-    is_explained = any(f.acts for f in [*axes, *of_dvl])
-    if not is_explained and (unlike := unlike_pair(right)):
-        return [*forces, *axes, *of_dvl, unlike]
-    tilt = find_start_tilt(right)
-    estimates, sources = surest_bias(driven, tilt)
-    up = UPRIGHT
-    motion = BodyMotion.of(right)
-    if motion is not None:
-        up = np.median(motion.up, axis=0)
-        of_heading = vertical_bias(right, motion)
-        if of_heading is not None:
-            allowed = right.calibration.imu.gyro_bias_sigma
-            estimates = with_vertical(estimates, of_heading.estimate, up, allowed)
-    D_heading = up * right.duration_s  # (3,)
-    bias = bias_findings(estimates, sources, right.calibration.imu, D_heading)
-    right, estimates = without_acting_bias(right, estimates)
-    by_motion = [
-        of_heading_alone(f, right, match.turn[2]) if f.quantity == HEADING_TURN else f
-        for f in motion_findings(right, config, estimates)
-    ]
-    of_vertical = [f for f in by_motion if f.quantity == VERTICAL_BIAS]
-    # one row on the bias that is known is enough
-    if any(f.estimate.is_known for f in of_vertical):
-        bias = [f for f in bias if f.estimate.is_known or f.acts]
-    # one line for all axes
-    if any(f.acts for f in of_vertical):
-        bias = [replace(f, cause=ALSO, consequence="", line="") for f in bias]
-    if any(f.acts and f.quantity.endswith(PITCH.name) for f in by_motion):
-        no_arm = "IMU or Doppler log is pitched"
-    # gyros that are late against the forces look like an arm
-    angles = (HEADING.name, AZIMUTH.name)
-    if any(f.quantity.startswith(angles) for f in acting_delays(by_motion)):
-        no_arm = "gyros or other sensors are late"
-    reference = list(reference_findings(right, config, tilt))
-    if right.calibration.start.states("rpy_rad"):
-        off = tilt.angle(1).minus(right.calibration.start.rpy_rad[1])
-        by_motion, is_imu = pitched_one(by_motion, off, right.calibration)
-        # a start by a pitched IMU is as wrong as its mounting
-        if is_imu:
-            reference = [f for f in reference if not f.quantity.startswith(START_TILT)]
-    # sensors that are wrong do not fit a right map either
-    is_sound = not any(finding.grave for finding in by_motion)
-    of_map = list(map_findings(right)) if is_sound else []
-    of_dvl, by_motion = by_late_imu(of_dvl, by_motion, config)
-    of_stamps = acting_delays([of_dvl[0], *by_motion, *reference])
-    if (of_stamps or tilting) and (role := drifting_role(sequence)):
-        cause = f"stamps of [{role}] drift from the times of recording, or jump"
-        line = f'`stamp = "log"` under [{role}] {IN_LOG_CONFIG}'
-        of_dvl[0] = replace(of_dvl[0], cause=cause, line=line, gravity=Gravity.GRAVE)
-        no_arm = "the stamps drift"
-        # other sensors look late as well, and forces at other times are a bias
-        axes = [f for f in axes if f not in tilting]
-        by_motion = [f for f in by_motion if not f.quantity.endswith(DELAYS)]
-        reference = [f for f in reference if f not in of_stamps]
-    if any(f.grave and GYRO_SCALE in f.line for f in by_motion):
-        # neither forces nor velocities fit turns of a wrong scale
-        axes = [f for f in axes if f not in tilting]
-        of_dvl = [f for f in of_dvl if f.quantity != DVL_SCALE or not f.acts]
-    if any(f.quantity == YAW for f in axes):
-        of_dvl = [f for f in of_dvl if f.quantity != YAW or f.acts]
-    if no_arm:
-        lever = [Finding(ARM, unknown(no_arm), "m")]
-    of_motion = [*forces, *axes, *of_dvl, *lever, *bias, *by_motion]
-    return [*of_motion, *reference, *of_map, *noise_findings(sequence)]
+    return x, y, z
 
 
-def unplaced_findings(sequence: Sequence, findings: list[Finding]) -> Iterator[Finding]:
+def unplaced_findings(sequence: Sequence, findings: Findings) -> Iterator[Finding]:
     """Mountings that are not known, where sensors contradict each other: they come before all that may follow from them."""
     warnings = sequence.notes.get("log.warnings", "").split("; ")
     roles = [text.partition(":")[0] for text in warnings if TAKEN_AS_ZERO in text]
@@ -433,8 +550,8 @@ def spoilt_by(sequence: Sequence) -> str:
     if STEPPED_BACK in sequence.notes.get("log.doubtful", ""):
         return STEPPED_BACK
     calibration = sequence.calibration
-    rows = (sequence.imu, sequence.dvl, sequence.depth, calibration)
-    fault = next(axis_doubts(*rows), "")
+    doubts = axis_doubts(sequence.imu, sequence.dvl, sequence.depth, calibration)
+    fault = next(doubts, "")
     if fault or lacks_gravity(sequence):
         return fault
     force = sequence.imu.specific_force
@@ -443,7 +560,7 @@ def spoilt_by(sequence: Sequence) -> str:
     return gravity if OTHER_WAYS in gravity or FELT_ALONG in gravity else ""
 
 
-def acting_delays(findings: Iterable[Finding]) -> list[Finding]:
+def acting_delays(findings: Iterable[Finding]) -> Findings:
     """Findings to act on about the stamps of a sensor against those of another."""
     return [f for f in findings if f.acts and f.quantity.endswith(DELAYS)]
 
@@ -457,8 +574,8 @@ def drifting_role(sequence: Sequence) -> str:
 
 
 def by_late_imu(
-    of_dvl: list[Finding], by_motion: list[Finding], config: LogConfig
-) -> tuple[list[Finding], list[Finding]]:
+    of_dvl: Findings, by_motion: Findings, config: LogConfig
+) -> tuple[Findings, Findings]:
     """Findings of the Doppler log and of others, where all are early against a late IMU with one line for the IMU."""
     late, *others = of_dvl
     offset = late.estimate
@@ -511,9 +628,7 @@ def without_stuck(sequence: Sequence) -> Sequence:
     return replace(sequence, imu=imu.rows(of_imu), dvl=dvl.rows(of_dvl))
 
 
-def force_findings(
-    sequence: Sequence, config: LogConfig
-) -> tuple[list[Finding], Sequence]:
+def force_findings(sequence: Sequence, config: LogConfig) -> Corrected:
     """Scale of the accelerometers by gravity, and the sequence with the scale put right."""
     found = force_scale(sequence, config)
     if found is not None and found.acts:
@@ -523,7 +638,7 @@ def force_findings(
     return [found] if found else [], sequence
 
 
-def tried_axes(sequence: Sequence, config: LogConfig) -> tuple[list[Finding], Sequence]:
+def tried_axes(sequence: Sequence, config: LogConfig) -> Corrected:
     """Findings about axes as of `axes_findings`; without a line where other sensors fit them worse."""
     findings, right = axes_findings(sequence, config)
     if right is not sequence and (names := brought_apart(sequence, right)):
@@ -538,9 +653,7 @@ def no_axes_finding(quantity: str, cause: str) -> Finding:
     return contradiction(quantity, cause, line, NO_AXES)
 
 
-def axes_findings(
-    sequence: Sequence, config: LogConfig
-) -> tuple[list[Finding], Sequence]:
+def axes_findings(sequence: Sequence, config: LogConfig) -> Corrected:
     """Findings about axes and signs of gyros and Doppler log, and the sequence with the axes put right."""
     calibration = sequence.calibration
     force = sequence.imu.specific_force
@@ -575,7 +688,7 @@ def axes_findings(
     is_level = found.dvl[2, 2] == 1.0
     if is_dvl and is_level and is_of_force(found.gyro, found.dvl):
         return force_axes(found, sequence, config)
-    findings = list[Finding]()
+    findings = Findings()
     if is_gyro:
         names = ", ".join(signed_axes(found.gyro))
         cause = (
@@ -599,9 +712,7 @@ def axes_findings(
     return findings, sequence
 
 
-def scaled_dvl(
-    found: AxesMatch, sequence: Sequence, config: LogConfig
-) -> tuple[list[Finding], Sequence]:
+def scaled_dvl(found: AxesMatch, sequence: Sequence, config: LogConfig) -> Corrected:
     """Another unit of the velocities, and the sequence with it put right."""
     times = 1 / found.scale
     cause = f"velocities change {times:.3g} times as much as the IMU measures"
@@ -612,11 +723,9 @@ def scaled_dvl(
     return [finding], replace(sequence, dvl=scaled)
 
 
-def force_axes(
-    found: AxesMatch, sequence: Sequence, config: LogConfig
-) -> tuple[list[Finding], Sequence]:
+def force_axes(found: AxesMatch, sequence: Sequence, config: LogConfig) -> Corrected:
     """Axes of the accelerometers that differ from those of gyros and Doppler log, and the sequence with them put right."""
-    R = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    R = sequence.calibration.imu.mounting.rotation_matrix()
     turn = R.T @ found.dvl.T @ R
     table = config.table("imu")
     before = axes_matrix(table.get("rotation", "flu"))
@@ -644,7 +753,7 @@ def gyro_axes_finding(
     axes: Floats, cause: str, sequence: Sequence, config: LogConfig
 ) -> Finding:
     """Axes of the gyros that differ from those of the accelerometers: the driver has them wrong."""
-    body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    body_R_imu = sequence.calibration.imu.mounting.rotation_matrix()
     # the line replaces that of the configuration
     given = config.table("imu").get("angular_velocity_axes", ("x", "y", "z"))
     driver = body_R_imu.T @ axes @ body_R_imu @ axes_matrix(given)
@@ -679,7 +788,7 @@ def dvl_axes_finding(axes: Floats, cause: str, sequence: Sequence) -> Finding:
 
     Gravity shows that the IMU is upright: a turn about another axis than the vertical is that of the Doppler log.
     """
-    body_R_dvl = sequence.calibration.dvl.mounting.pose().rotation().matrix()
+    body_R_dvl = sequence.calibration.dvl.mounting.rotation_matrix()
     if np.linalg.det(axes) > 0:
         rpy = gtsam.Rot3(axes @ body_R_dvl).rpy()
         cause += (
@@ -704,7 +813,7 @@ def axes_cause(found: AxesMatch) -> str:
 
 def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
     """Sequence with velocities along other axes of the body."""
-    R = sequence.calibration.dvl.mounting.pose().rotation().matrix()
+    R = sequence.calibration.dvl.mounting.rotation_matrix()
     turn = R.T @ axes @ R
     dvl = sequence.dvl
     cov = turn @ dvl.velocity_cov @ turn.T
@@ -714,14 +823,14 @@ def turned_dvl(sequence: Sequence, axes: Floats) -> Sequence:
 
 def motion_findings(
     right: Sequence, config: LogConfig, bias: Estimates3D | None = None
-) -> list[Finding]:
+) -> Findings:
     """Depth, heading, fixes and sightings against the motion of the body, and the gyros' bias about the vertical."""
     motion = BodyMotion.of(right)
     if motion is None:
         return []
     matches = {check: check.compare(right, motion) for check in CHECKS}
     against_gyros = names_of_opposite(matches, (HEADING, POSITIONS, AZIMUTH))
-    found = list[Finding]()
+    found = Findings()
     # one of them may be mirrored; of two, the gyros or the Doppler log are
     rightly_turned = right
     if backwards := reversed_dvl(right, matches):
@@ -853,9 +962,7 @@ def judged_scale(finding: Finding, apart: str) -> Finding:
     return replace(finding, cause=cause, line=unused(HEADING.role))
 
 
-def dvl_findings(
-    found: DvlMatch, sequence: Sequence, config: LogConfig
-) -> list[Finding]:
+def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> Findings:
     """Time offset, mounting yaw and scale of the DVL."""
     offset = with_instant(found.offset, sequence.imu)
     late = offset_row("DVL against IMU", offset, "dvl", config)
@@ -920,13 +1027,8 @@ def with_instant(offset: Estimate1D, imu: Imu) -> Estimate1D:
     if len(imu) < 2:
         return offset
     interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
-    sigma = float(np.hypot(offset.sigma, interval_s / np.sqrt(12)))
+    sigma = np.hypot(offset.sigma, interval_s / np.sqrt(12))
     return replace(offset, sigma=sigma)
-
-
-def level_speed_m_s(dvl: Dvl) -> float:
-    """Root mean square along x and y of the Doppler log."""
-    return float(np.sqrt(np.mean(np.sum(dvl.velocity[:, :2] ** 2, axis=1))))
 
 
 def shifted(dvl: Dvl, offset: Estimate1D) -> Dvl:
@@ -936,7 +1038,7 @@ def shifted(dvl: Dvl, offset: Estimate1D) -> Dvl:
 
 
 def corrected_sequence(
-    sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]
+    sequence: Sequence, match: DvlMatch, of_dvl: Findings
 ) -> Sequence:
     """Sequence with the advised changes: stamps, yaw and scale of the DVL, lever arm, sigma of the gyro bias."""
     is_late, is_turned, is_scaled = (finding.acts for finding in of_dvl)
@@ -949,20 +1051,9 @@ def corrected_sequence(
     return TurnedPair(right, turn_rad).as_if("dvl") if is_turned else right
 
 
-def leaning_pair(match: DvlMatch, sequence: Sequence) -> tuple[list[Finding], Sequence]:
-    """Doppler log and IMU that are turned against each other about a level axis, and the sequence with it put right."""
-    known_rad = known_values(match.turn[:2])
-    axis = int(np.argmax(np.abs(known_rad)))
-    if not matters(match.turn[axis], LEAST_LEAN_RAD):
-        return [], sequence
-    pair = TurnedPair(sequence, np.append(known_rad, 0.0))
-    angle = in_degrees(match.turn[axis])
-    return [pair.finding(LEVEL_TURNS[axis], angle, TURNED)], pair.corrected()
-
-
 def surest_bias(
     of_drive: Estimates3D, tilt: StartTilt
-) -> tuple[Estimates3D, tuple[str, str, str]]:
+) -> tuple[Estimates3D, tuple[str, ...]]:
     """Gyro bias of the whole drive or of a rest, whichever is more certain on each axis, and its source."""
     still = tilt.gyro_bias() or of_drive
     found = list[tuple[Estimate1D, str]]()
@@ -976,8 +1067,8 @@ def surest_bias(
         if rival.is_known and matters(apart, LEAST_BIAS_RAD_S, rival.sigma):
             source += f" ({of_rival} {with_interval(rival, 'rad/s')})"
         found.append((bias, source))
-    (x, of_x), (y, of_y), (z, of_z) = found
-    return (x, y, z), (of_x, of_y, of_z)
+    biases, sources = zip(*found, strict=True)
+    return biases, sources
 
 
 def with_vertical(
@@ -1000,8 +1091,7 @@ def with_vertical(
         both = replace(vertical, value=by_heading)
         if matters(both, LEAST_BIAS_RAD_S, allowed):
             return bias
-    x, y, z = (both if k == axis else one for k, one in enumerate(bias))
-    return x, y, z
+    return tuple(both if k == axis else one for k, one in enumerate(bias))
 
 
 def without_acting_bias(
@@ -1010,10 +1100,10 @@ def without_acting_bias(
     """The sequence with the bias that its line states, and what is left of the bias."""
     imu = sequence.calibration.imu
     acting = [one.value for one in acting_bias(bias, imu)]
-    x, y, z = map(Estimate1D.minus, bias, acting)
+    left = tuple(map(Estimate1D.minus, bias, acting))
     update = {"imu": with_bias(bias, imu)}
     calibration = sequence.calibration.model_copy(update=update)
-    return replace(sequence, calibration=calibration), (x, y, z)
+    return replace(sequence, calibration=calibration), left
 
 
 def reference_findings(
@@ -1036,7 +1126,7 @@ def reference_findings(
     quantity = "first headings of the reference: error"
     jump = Finding(quantity, in_degrees(error), "°", cause)
     yield judged(jump, error, LEAST_HEADING_RAD)
-    of_heading = list[Finding]()
+    of_heading = Findings()
     yaw_rad = start.rpy_rad[2]
     # a start that is found in the map, or that defines the world, has no heading that could be wrong
     if offset.is_known and start != Start() and start.source not in ("map", "vehicle"):
@@ -1072,7 +1162,7 @@ def mirrored_reference(sequence: Sequence, config: LogConfig) -> Iterator[Findin
 FEWEST_STATED = 20
 LARGEST_STATED = 20.0
 """Stated sigma of velocities over their scatter from row to row, from which on it is in another unit."""
-SECOND_DIFFERENCE = float(np.sqrt(6.0))
+SECOND_DIFFERENCE = np.sqrt(6.0)
 """Sigma of ``v[k] - 2 v[k + 1] + v[k + 2]`` over that of v."""
 
 
@@ -1083,11 +1173,11 @@ def stated_noise(dvl: Dvl) -> Iterator[Finding]:
     if np.count_nonzero(stated) < FEWEST_STATED:
         return
     velocity = dvl.velocity[stated]
-    sigma_m_s = float(np.sqrt(np.median(variances[stated])))
+    sigma_m_s = np.sqrt(np.median(variances[stated]))
     bent = np.abs(velocity[2:] - 2.0 * velocity[1:-1] + velocity[:-2])
     # a median: steps and spikes are not noise
     scatter_m_s = float(np.median(bent)) / (0.6745 * SECOND_DIFFERENCE)
-    size_m_s = float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
+    size_m_s = np.sqrt(np.mean(np.sum(velocity**2, axis=1)))
     if sigma_m_s <= max(LARGEST_STATED * scatter_m_s, size_m_s):
         return
     yield contradiction(

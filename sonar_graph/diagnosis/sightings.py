@@ -80,7 +80,7 @@ def sighting_changes(
     def place_of(azimuth: Floats) -> Floats:
         """Landmarks in the body at the first sighting, shape (k, 3)."""
         ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
-        return np.asarray(lever + (seen.range_m[i, None] * ahead) @ R.T)
+        return lever + (seen.range_m[i, None] * ahead) @ R.T
 
     as_seen = place_of(azimuth)
     to_the_left = place_of(azimuth + np.pi / 2)
@@ -104,12 +104,12 @@ def sighting_changes(
 
     def by_range(at: Floats, place: Floats = as_seen) -> Floats:
         found = after(at, place)
-        return np.asarray(np.linalg.norm(found, axis=-1) - seen.range_m[i])
+        return np.linalg.norm(found, axis=-1) - seen.range_m[i]
 
     def by_azimuth(at: Floats) -> Floats:
         found = after(at)
         turned = np.arctan2(found[..., 1], found[..., 0]) - azimuth
-        return np.asarray(wrap_angle(turned))
+        return wrap_angle(turned)
 
     def by_others(at: Floats) -> Floats:
         """What a current of 1 m/s along each axis of the path, and a height of sqrt(2) m, take off a range, shape (k, 4).

@@ -61,6 +61,8 @@ class SignalStretch:
     """x at times of any shape; NaN where it is not known."""
     has_offset: bool = True
     """False for changes, which have none."""
+    slow_sigma: float = 0.0
+    """Error of the reference that changes as slowly as the motion: of a sensor without noise, the residuals hide it."""
     beside: Callable[[Floats], Values] | None = None
     """What else may move the sensor, shape (n, q), by the table of checks."""
 
@@ -85,7 +87,7 @@ class SignalStretch:
     def slope(self, lag_s: float) -> Values:
         """Derivative of x by time at the rows, shape (n,)."""
         before, after = self.shifted(lag_s + LAG_STEP_S * np.array([1.0, -1.0]))
-        return np.asarray((after - before) / (2 * LAG_STEP_S))
+        return (after - before) / (2 * LAG_STEP_S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,8 @@ class Match:
     """What was compared."""
     whole: tuple[SignalStretch, ...] = ()
     """The same in one piece for each part of the log."""
+    interval_s: float = 0.0
+    """Between rows of the reference, where it is an integral that counts as even there."""
 
     def in_time(self) -> "Match":
         """The same with the sensor's delay taken off what is in one piece."""
@@ -120,7 +124,7 @@ class Match:
 
     def less_certain(self, sigma: float) -> "Match":
         """The same with an error of the gain by what the comparison leaves out."""
-        whole = float(np.hypot(self.gain.sigma, sigma))
+        whole = np.hypot(self.gain.sigma, sigma)
         return replace(self, gain=replace(self.gain, sigma=whole))
 
     @classmethod
@@ -288,6 +292,8 @@ def refined(
             continue
         c = found.p[0, 0]
         sigmas = found.sigmas()
+        moved = root_mean_square([moved_in(stretch, has_drift=drift_sigma > 0)])
+        sigmas[0] = np.hypot(sigmas[0], stretch.slow_sigma / max(moved, 1e-9))
         size = max(abs(c), 1e-12)
         gains.append((abs(c) if np.iscomplexobj(c) else float(c), sigmas[0]))
         angles.append((float(np.angle(c)), sigmas[0] / size))
@@ -378,13 +384,20 @@ class SignalStep(NamedTuple):
 
 
 def steps(
-    seconds: Floats, y: Values, x: Values, sigma: float, ratio: float
+    seconds: Floats,
+    y: Values,
+    x: Values,
+    sigma: float,
+    ratio: float,
+    doubt: Floats | None = None,
 ) -> list[SignalStep]:
     """Steps of a sensor y beyond its reference x, shape (n,) or (n, k) both; nothing where there are many.
 
     The difference of the medians of `STEP_ROWS` rows of ``y - x`` on either side of an instant is beyond `STEP_SIGMAS`
     of its own typical size, and beyond `LEAST_STEP` of ``sigma``, that of a row; so is that of three times as many. A
     vehicle that stops and goes shows a wrong scale in steps: those of x must be smaller by a ``ratio``.
+
+    ``doubt``: by how much x may be wrong at each row, shape (n,); NaN counts as 0.
     """
     beyond = as_columns(y - x)
     known = np.isfinite(beyond).all(axis=1)
@@ -396,6 +409,8 @@ def steps(
     # what drifts away changes by three times as much
     size[near < wide / 2] = 0.0
     size[size < ratio * median_changes(as_columns(x)[known], STEP_ROWS)] = 0.0
+    if doubt is not None:
+        size[size < np.nan_to_num(doubt[known])] = 0.0
     typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
     least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)
     found = list[SignalStep]()
@@ -430,7 +445,7 @@ def centred(values: Values, stretch: SignalStretch) -> Values:
     """Values about their mean, but for changes."""
     known = values[np.isfinite(values)]
     has_mean = stretch.has_offset and len(known)
-    return np.asarray(values - known.mean()) if has_mean else values
+    return values - known.mean() if has_mean else values
 
 
 def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
@@ -443,7 +458,7 @@ def moved_in(stretch: SignalStretch, *, has_drift: bool) -> Values:
         return x * np.nan
     t = stretch.seconds - stretch.seconds.mean()
     line = np.polynomial.Polynomial.fit(t[known], x[known], 1)
-    return np.asarray(x - line(t))
+    return x - line(t)
 
 
 def root_mean_square(parts: list[Values]) -> float:
@@ -460,4 +475,4 @@ def weighted(estimates: list[tuple[float, float]]) -> Estimate1D:
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
     mean = float(weights @ values / weights.sum())
     scatter = float(weights @ (values - mean) ** 2) / max(len(values) - 1, 1)
-    return Estimate1D(mean, float(np.sqrt(max(scatter, 1.0) / weights.sum())))
+    return Estimate1D(mean, np.sqrt(max(scatter, 1.0) / weights.sum()))

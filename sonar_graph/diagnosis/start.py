@@ -15,6 +15,7 @@ from sonar_graph.diagnosis.findings import (
     INTERVAL_SIGMAS,
     NO_NEED,
     Finding,
+    Findings,
     gravity_of,
     in_degrees,
     judged,
@@ -57,7 +58,7 @@ LARGE_ACCEL_BIAS_M_S2 = 0.15
 NO_GRAVITY = "no gravity in the specific forces"
 
 
-def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
+def lever_findings(found: DvlMatch, calibration: Calibration) -> Findings:
     """One row for each axis; a single row where no axis is known.
 
     The arm is a difference of two places, and nothing shows which of them is wrong.
@@ -72,7 +73,7 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
         f"`imu.mounting.translation_m = {numbers(imu, 3)}` {IN_CALIBRATION} or, if that place is sure, "
         f"`dvl.mounting.translation_m = {numbers(dvl, 3)}`"
     )
-    rows = list[Finding]()
+    rows = Findings()
     given = given_arm(calibration)
     for axis, estimate, place in zip(AXES, found.lever, given, strict=True):
         of_calibration = f"the calibration's {place:+.2f} m"
@@ -91,6 +92,7 @@ def given_arm(calibration: Calibration) -> Floats:
 
 def arm_error(found: DvlMatch, calibration: Calibration) -> Floats:
     """Error of the calibration's arm, shape (3,), m; 0 along an axis on which nothing need be done."""
+    # an axis on which nothing is known keeps the calibration's number
     errors = map(Estimate1D.minus, found.lever, given_arm(calibration))
     return np.array([e.value if matters(e, LEAST_LEVER_M) else 0.0 for e in errors])
 
@@ -112,7 +114,7 @@ def without_bias(imu: Imu, calibration: Calibration) -> Imu:
 
 def accel_bias_findings(
     found: DvlMatch, calibration: Calibration
-) -> tuple[list[Finding], Calibration]:
+) -> tuple[Findings, Calibration]:
     """A row for each axis on which the accelerometers' bias is beyond its sigma, and the calibration with it.
 
     A large one along the vertical would change the size of gravity, which `force_scale` compares: it is none, and shows
@@ -123,7 +125,8 @@ def accel_bias_findings(
         return [], calibration
     imu = calibration.imu
     allowed = imu.accel_bias_sigma
-    body_R_imu = imu.mounting.pose().rotation().matrix()
+    # the calibration states biases in the axes of the sensor
+    body_R_imu = imu.mounting.rotation_matrix()
     in_imu = body_R_imu.T @ known_values(found.accel_bias)
     whole = np.add(imu.accel_bias_m_s2, in_imu)
     line = f"`imu.accel_bias_m_s2 = {numbers(whole, 3)}` {IN_CALIBRATION}"
@@ -156,7 +159,7 @@ def acting_bias(bias: Estimates3D, imu: ImuCalibration) -> list[Estimate1D]:
 def with_bias(bias: Estimates3D, imu: ImuCalibration) -> ImuCalibration:
     """Calibration with the bias and its sigma that the findings advise."""
     acting = acting_bias(bias, imu)
-    body_R_imu = imu.mounting.pose().rotation().matrix()
+    body_R_imu = imu.mounting.rotation_matrix()
     whole = np.add(imu.gyro_bias_rad_s, body_R_imu.T @ known_values(acting))
     sigma = max(imu.gyro_bias_sigma, *(one.sigma for one in acting))
     update = {"gyro_bias_rad_s": tuple(whole.tolist()), "gyro_bias_sigma": sigma}
@@ -165,10 +168,10 @@ def with_bias(bias: Estimates3D, imu: ImuCalibration) -> ImuCalibration:
 
 def bias_findings(
     bias: Estimates3D,
-    sources: tuple[str, str, str],
+    sources: tuple[str, ...],
     imu: ImuCalibration,
     D_heading: Floats,
-) -> list[Finding]:
+) -> Findings:
     """One row for each body axis with its source, such as "from 12 s of rest"; a single row where no axis is known.
 
     ``D_heading``: derivative of the heading at the end by the bias, shape (3,), s. Gravity holds roll and pitch.
@@ -184,11 +187,11 @@ def bias_findings(
     turned_rad = D_heading @ known_values(acting_bias(bias, imu))
     # all axes together turn the vehicle
     large = 0.0 if abs(turned_rad) > LARGE_TURN_RAD else np.inf
-    rows = list[Finding]()
+    rows = Findings()
     for axis, estimate, source in zip(AXES, bias, sources, strict=True):
         cause = f"{source}, beyond the calibration's sigma of {allowed:.2g}"
         row = Finding(f"{BIAS}, {axis}", estimate, "rad/s", cause, line=line)
-        sigma = float(np.hypot(allowed, estimate.sigma))
+        sigma = np.hypot(allowed, estimate.sigma)
         is_doubted = abs(estimate.value) > 2.0 * sigma
         judgement = "is not surely exceeded" if is_doubted else "allows it"
         fits = (
@@ -205,6 +208,7 @@ def turned_mounting(
     mounting: Mounting, turn_rad: Floats | tuple[float, float, float]
 ) -> tuple[float, float, float]:
     """Roll, pitch and yaw of a mounting after a turn, a rotation vector along the body's axes, shape (3,)."""
+    # the turn is along the body's axes, so that it goes in front
     before = Rotation.from_euler("ZYX", mounting.rpy_rad[::-1])
     after = Rotation.from_rotvec(turn_rad) * before
     yaw, pitch, roll = after.as_euler("ZYX").tolist()
@@ -235,19 +239,19 @@ class StartTilt:
         if self.tilt is None:
             return unknown(self.said)
         value = (self.tilt.roll_rad, self.tilt.pitch_rad)[axis]
-        return Estimate1D(value, float(np.sqrt(self.tilt.covariance[axis, axis])))
+        return Estimate1D(value, np.sqrt(self.tilt.covariance[axis, axis]))
 
     def gyro_bias(self) -> Estimates3D | None:
         """Bias from a rest; None in motion, where the whole drive shows more than its first minute."""
         if self.tilt is None or not self.is_rest:
             return None
         sigmas = np.sqrt(np.diag(self.tilt.covariance)[2:]).tolist()
-        x, y, z = map(Estimate1D, self.tilt.gyro_bias.tolist(), sigmas)
-        return x, y, z
+        return tuple(map(Estimate1D, self.tilt.gyro_bias.tolist(), sigmas))
 
 
 def find_start_tilt(sequence: Sequence) -> StartTilt:
     """Alignment at rest if the vehicle rests at the start, else in motion, of a log with the other faults corrected."""
+    # without forces, or without gravity in them, nothing shows which way is up
     if np.isnan(sequence.imu.specific_force).all():
         return StartTilt(None, "no accelerometers")
     if lacks_gravity(sequence):
@@ -284,6 +288,7 @@ def rest_tilt(sequence: Sequence) -> StartTilt:
         try:
             tilt = align_at_rest(imu, sequence.calibration, dvl)
         except AlignmentError as error:
+            # a longer rest that fails leaves the shorter one that held
             if found.tilt is None:
                 return StartTilt(None, without_advice(error))
             break
@@ -319,20 +324,22 @@ def turn_by_heading(
     yaw_rad = yaw_rad - yaw_rad.mean()
     rate = float(t @ yaw_rad / (t @ t))
     sigma = 2.0 * float(np.std(yaw_rad - rate * t)) / float(np.ptp(t))
+    # only the part about the vertical can be a turn that a heading shows
     body_R_level = Rotation.from_euler("YX", [tilt.pitch_rad, tilt.roll_rad]).inv()
     up = body_R_level.apply([0.0, 0.0, 1.0])
     by_gyros = float(up @ tilt.gyro_bias)
-    rate = float(np.copysign(rate, by_gyros))  # also of a compass that runs mirrored
+    rate = np.copysign(rate, by_gyros)  # also of a compass that runs mirrored
     if abs(rate) < 4.0 * sigma or abs(rate - by_gyros) > 0.5 * abs(by_gyros):
         return None
     covariance = tilt.covariance.copy()
+    # the bias is now as unsure about the vertical as the heading's rate
     covariance[2:, 2:] += sigma**2 * np.outer(up, up)
     return replace(tilt, gyro_bias=tilt.gyro_bias - rate * up, covariance=covariance)
 
 
 def tilt_findings(
     found: StartTilt, calibration: Calibration, yaw_rad: float
-) -> list[Finding]:
+) -> Findings:
     """One row each for roll and pitch, and a line for the calibration with this heading; a single row without them.
 
     Where a start is stated, gravity differs from it by a wrong start or by a wrong mounting of the IMU.
@@ -355,8 +362,9 @@ def tilt_findings(
             turned = turned.model_copy(update={"rpy_rad": rpy_rad})
         of_imu = f"`imu.mounting.rpy_rad = {numbers(turned.rpy_rad, 4)}`"
         line += f" or, if that start is sure, {of_imu}"
-    rows = list[Finding]()
-    for axis, (name, angle) in enumerate({"roll": roll, "pitch": pitch}.items()):
+    rows = Findings()
+    for axis, name in enumerate(("roll", "pitch")):
+        angle = found.angle(axis)
         given = start.rpy_rad[axis]
         off_rad = wrap_angle(angle.value - given)
         allowed_rad = start.rpy_sigma_rad[axis]
@@ -395,12 +403,13 @@ def start_heading_finding(
         roll = tilt.tilt.roll_rad
         pitch = tilt.tilt.pitch_rad
         of_tilt = f", with roll and pitch {tilt.said}"
+    # an error of the stamps turns the heading by as much as the vehicle turns meanwhile
     near_ns = at_ns + np.array([-1, 1]) * (TURN_OVER_NS // 2)
     near_ns = np.clip(near_ns, first_ns, last_ns)
     begin, end = reference.at(near_ns).rotations()
     turned_rad = float((begin.inv() * end).magnitude())
     turn_rate = turned_rad * NS_PER_S / max(int(np.ptp(near_ns)), 1)
-    spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
+    spread = np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma)
     start = sequence.calibration.start
     error = Estimate1D(wrap_angle(start.rpy_rad[2] - yaw), spread)
     row = Finding(

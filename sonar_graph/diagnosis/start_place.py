@@ -49,6 +49,7 @@ def start_place_findings(right: Sequence, motion: BodyMotion) -> Iterator[Findin
     true = right.true_landmarks
     if true is None or right.detections is None or not len(true):
         return
+    # true places are a map without errors
     known = KnownMap.of(true.ids.tolist(), true.positions, sigma_m=TRUE_SIGMA_M)
     found = first_start(right, known)
     if found is not None:
@@ -62,6 +63,7 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
         return
     seen = set(right.detections.most_probable()[0].tolist())
     identities = {i for i in seen if 0 <= i < FIRST_ANONYMOUS_ID}
+    # landmarks that were never named could be any of the map
     if identities and identities.isdisjoint(known.ids):
         yield contradiction(
             "map: identities",
@@ -70,6 +72,7 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
             "none in common",
         )
         return
+    # a map in another unit or sense fits nowhere: such mistakes are looked for first
     fit = map_fit(right)
     if not fit.is_checked:
         why = "fewer than three of its landmarks are seen"
@@ -91,7 +94,7 @@ def map_findings(right: Sequence) -> Iterator[Finding]:
             gravity=Gravity.ACT,
         )
     if fit.start is not None:
-        sigma = float(np.sqrt(fit.start.covariance[0, 0]))
+        sigma = np.sqrt(fit.start.covariance[0, 0])
         turn = Estimate1D(wrap_angle(fit.start.parameters[0]), sigma)
         agreeing = [known.ids[row] for row in fit.start.agreeing]
         fits = f"the sightings of landmarks {listed(agreeing)} fit the map, {NO_NEED}"
@@ -132,6 +135,7 @@ def stated_start_findings(
     turn_rad = wrap_angle(yaw - start.rpy_rad[2])
     off = np.array([turn_rad, x - stated_x, y - stated_y])
     sigmas = [start.rpy_sigma_rad[2], *start.position_sigma_m[:2]]
+    # Mahalanobis distance, with the uncertainty of both poses
     P = found.covariance + np.diag(np.square(sigmas))
     is_near = np.hypot(*off[1:]) <= FARTHEST_M and abs(off[0]) <= FARTHEST_RAD
     if is_near or float(off @ np.linalg.solve(P, off)) <= ACTING_SIGMAS**2:
@@ -156,10 +160,11 @@ def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
         return None
     start = right.calibration.start
     x, y, _ = truth.at(np.array([begin_ns])).positions[0].tolist()
-    off_m = float(np.hypot(*np.subtract((x, y), start.position_m[:2])))
+    off_m = np.hypot(*np.subtract((x, y), start.position_m[:2]))
+    # stamps of the truth that are off by a second move it by the way of that second
     soon = motion.seconds <= motion.seconds[0] + STAMPS_S
     way_m = float(np.abs(motion.path_m[soon] - motion.path_m[0]).max())
-    sigma_m = float(np.hypot(*start.position_sigma_m[:2]))
+    sigma_m = np.hypot(*start.position_sigma_m[:2])
     if off_m <= FARTHEST_M + way_m + ACTING_SIGMAS * sigma_m:
         return None
     return contradiction(

@@ -88,12 +88,14 @@ def turn_match(motion: BodyMotion) -> TurnMatch | None:
     r[speed_m_s <= LEAST_SPEED_M_S] = np.nan
     if np.count_nonzero(np.isfinite(r).all(axis=1)) < FEWEST_ROWS:
         return None
+    # a wrong rate leaves nothing along the velocity, so that this part is noise
     noise = max(root_mean_square([np.sum(r * along, axis=1)]), 1e-12)
     excess = root_mean_square([np.sum(r * across, axis=1)]) / noise
     # over the windows of the forces
     turned = running_integral(t, np.cross(felt.rate_rad_s, felt.velocity_m_s))
     by_rate = felt.windows.rates(lambda at: columns_at(at, t, turned))
     changed = felt.windows.rates(lambda at: columns_at(at, t, felt.velocity_m_s))
+    # what the Doppler log alone measures: the change of velocity in the body
     by_velocity = changed - by_rate
     found = gain_along(motion, by_rate, r, across)
     of_scale = gain_along(motion, by_velocity, r, along).gain
@@ -130,11 +132,12 @@ def turn_rate_finding(sequence: Sequence, config: LogConfig) -> Finding | None:
         "vertical are dead, clipped, filtered or of another scale",
         consequence="headings and positions are wrong from the first turn on",
     )
+    # factors that drivers get wrong, tried before any other scale
     rate_hz = NS_PER_S / float(np.median(np.diff(sequence.imu.stamps_ns)))
     causes = {
         rate_hz: "angles between two samples, not rates?",
-        float(np.radians(1.0)): "degrees?",
-        float(np.degrees(1.0)): "radians that were converted twice?",
+        np.radians(1.0): "degrees?",
+        np.degrees(1.0): "radians that were converted twice?",
     }
     for factor, why in causes.items() if is_wrong else ():
         right = rate_match(scaled_gyros(sequence, factor * np.eye(3)))
@@ -191,7 +194,7 @@ def is_borne_out(found: Match, sequence: Sequence) -> bool:
 def scaled_gyros(sequence: Sequence, scales: Floats) -> Sequence:
     """Sequence with rates of the body times a matrix, shape (3, 3)."""
     imu = sequence.imu
-    body_R_imu = sequence.calibration.imu.mounting.pose().rotation().matrix()
+    body_R_imu = sequence.calibration.imu.mounting.rotation_matrix()
     rate = imu.angular_velocity @ (body_R_imu.T @ scales @ body_R_imu).T
     return replace(sequence, imu=replace(imu, angular_velocity=rate))
 

@@ -56,8 +56,10 @@ class TurnedPair:
 
     def wrong_one(self) -> str:
         """``dvl`` or ``imu``; empty where nothing else decides."""
+        # other sensors show a turn about the vertical, gravity one about a level axis
         if self.turn_rad[:2].any():
             return self.wrong_one_by_start()
+        # with the right one turned back, ranges to landmarks fit better
         scatters = dict[str, float]()
         for role in ("dvl", "imu"):
             right = self.as_if(role)
@@ -88,7 +90,7 @@ class TurnedPair:
                 return ""
             roll = wrap_angle(found.tilt.roll_rad - start.rpy_rad[0])
             pitch = found.tilt.pitch_rad - start.rpy_rad[1]
-            off_rad[role] = float(np.hypot(roll, pitch))
+            off_rad[role] = np.hypot(roll, pitch)
         best, worst = sorted(off_rad, key=off_rad.__getitem__)
         # a start that is tilted as much as the pair is turned may have been read off a turned IMU
         is_tilted = np.hypot(*start.rpy_rad[:2]) > 0.5 * np.linalg.norm(self.turn_rad)

@@ -13,6 +13,7 @@ from sonar_graph.diagnosis.findings import (
     IN_CALIBRATION,
     IN_LOG_CONFIG,
     Finding,
+    Findings,
     contradiction,
     judged,
     scale_line,
@@ -56,13 +57,13 @@ LARGEST_TILT_RATIO = 10.0
 """Tilting by gyros over that by gravity: below 1 in rad/s but for the gyros' noise, up to 57 in degrees."""
 
 
-def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
+def wrong_units(sequence: Sequence, config: LogConfig) -> Findings:
     """Velocities, rates and specific forces in an implausible unit; the configured scales enter the lines."""
     checks = (velocity_unit, rate_unit, force_unit)
     return [finding for check in checks for finding in check(sequence, config)]
 
 
-def coarse_findings(sequence: Sequence) -> list[Finding]:
+def coarse_findings(sequence: Sequence) -> Findings:
     """Velocities and rates that come in steps far above their stated noise, rounded or cut by a driver.
 
     Where noise is above the step of a sensor, rows differ and means are right. Else a cut towards zero takes half of a
@@ -85,7 +86,7 @@ def coarse_findings(sequence: Sequence) -> list[Finding]:
         z_m = sequence.depth.z_m[:, None]
         of_depth = "`depth.sigma_m = {0:.2g}`"
         rows.append(("depth", "m", z_m, calibration.depth.sigma_m, of_depth))
-    found = list[Finding]()
+    found = Findings()
     for name, unit, values, sigma, line in rows:
         step = coarse_step(values)
         if step / 2 > COARSE_SIGMAS * sigma:
@@ -104,10 +105,8 @@ def coarse_findings(sequence: Sequence) -> list[Finding]:
 
 def coarse_step(values: Floats) -> float:
     """Largest step of the axes on which most of the rows, shape (n, k), repeat the one before; 0 without such an axis."""
-    steps = np.abs(np.diff(values, axis=0))
-    steps = steps[np.isfinite(steps).all(axis=1)]
     coarsest = 0.0
-    for column in steps.T:
+    for column in np.abs(np.diff(values, axis=0)).T:
         changes = column[column > 0]
         if FEWEST_CHANGES <= len(changes) < len(column) / 2:
             step = float(changes.min())
@@ -160,11 +159,13 @@ def rate_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
 
 def force_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
     """Typical specific forces that are gravity in another unit."""
-    forces = lengths(sequence.imu.specific_force)
+    forces = sequence.imu.specific_force
+    forces = forces[np.isfinite(forces).all(axis=1)]
     if not len(forces):
         return
-    typical = float(np.median(forces))
+    typical = float(np.median(np.linalg.norm(forces, axis=1)))
     gravity = sequence.calibration.gravity_m_s2
+    # of units that differ little the nearest counts
     unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
     if abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
         return
@@ -186,13 +187,13 @@ def force_scale(sequence: Sequence, config: LogConfig) -> Finding | None:
     seconds = sequence.imu.stamps_ns[is_measured] // NS_PER_S
     _, first, count = np.unique(seconds, return_index=True, return_counts=True)
     sums = np.add.reduceat(sequence.imu.specific_force[is_measured], first, axis=0)
-    forces = lengths(sums / count[:, None])
+    forces = np.linalg.norm(sums / count[:, None], axis=1)
     gravity = sequence.calibration.gravity_m_s2
     typical = float(np.median(forces)) if len(forces) else 0.0
     if not 1 / MOST_OF_GRAVITY < typical / gravity < MOST_OF_GRAVITY:
         return None
-    imu = sequence.calibration.imu
-    scale = Estimate1D(typical / gravity, imu.accel_bias_sigma / gravity)
+    sigma = sequence.calibration.imu.accel_bias_sigma / gravity
+    scale = Estimate1D(typical / gravity, sigma)
     row = Finding(
         "accelerometer scale",
         scale,
@@ -217,6 +218,7 @@ def tilt_rates(imu: Imu) -> tuple[float, float] | None:
     is_measured = np.isfinite(force).all() and force.any(axis=1).all()
     if np.count_nonzero(is_next) < LEAST_SECONDS or not is_measured:
         return None
+    # over a second what accelerates a vehicle is small beside gravity
     up = force / np.linalg.norm(force, axis=1)[:, None]
     rate = np.add.reduceat(imu.angular_velocity, first, axis=0) / count[:, None]
     rate = rate - np.median(rate, axis=0)  # a bias turns nothing
@@ -232,24 +234,24 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
     """
     seen = sequence.detections
     dvl = sequence.dvl
-    rows = np.flatnonzero(np.isfinite(dvl.velocity).all(axis=1))
-    if seen is None or len(rows) < MEDIAN_ROWS:
+    if seen is None or len(dvl) < MEDIAN_ROWS:
         return None
-    origin_ns = dvl.stamps_ns[rows[0]]
-    dvl_s = (dvl.stamps_ns[rows] - origin_ns) / NS_PER_S
+    origin_ns = dvl.stamps_ns[0]
+    dvl_s = (dvl.stamps_ns - origin_ns) / NS_PER_S
     t = (seen.stamps_ns - origin_ns) / NS_PER_S
+    # gyros may be wrong too, so that only the Doppler log moves the vehicle here
     pairs = sighting_pairs(seen, t, dvl_s[-1])
     if pairs is None:
         return None
     i, j = pairs.T
     calibration = sequence.calibration
-    v = dvl.velocity[rows] @ calibration.dvl.mounting.pose().rotation().matrix().T
+    v = dvl.velocity @ calibration.dvl.mounting.rotation_matrix().T
     v = median_filter(v, size=(MEDIAN_ROWS, 1))  # outliers would add up
     path = running_integral(dvl_s, v)
     moved = columns_at(t[j], dvl_s, path) - columns_at(t[i], dvl_s, path)
     azimuth = seen.azimuth_rad
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
-    u = ahead @ calibration.sonar.mounting.pose().rotation().matrix().T
+    u = ahead @ calibration.sonar.mounting.rotation_matrix().T
     by_dvl = np.abs(np.einsum("ka,ka->k", moved, (u[i] + u[j]) / 2))
     measured = np.abs(seen.range_m[j] - seen.range_m[i])
     least = calibration.sonar.range_sigma_m
@@ -259,10 +261,4 @@ def range_changes(sequence: Sequence) -> tuple[float, float] | None:
 
 def exceeded_by_few(vectors: Floats) -> float:
     """Length that one in twenty vectors exceeds, so that spikes do not count."""
-    found = lengths(vectors)
-    return float(np.percentile(found, HIGH_PERCENTILE)) if len(found) else 0.0
-
-
-def lengths(vectors: Floats) -> Floats:
-    """Lengths of the finite rows."""
-    return np.asarray(np.linalg.norm(vectors[np.isfinite(vectors).all(axis=1)], axis=1))
+    return float(np.percentile(np.linalg.norm(vectors, axis=1), HIGH_PERCENTILE))

@@ -10,19 +10,18 @@ from sonar_graph.evaluation.aligned import aligned_to_truth
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, ErrorSeries, RunResult, Score, gathered
 from sonar_graph.evaluation.run import check_request, one_line, run_estimator, run_here
 from sonar_graph.evaluation.scored_instants import (DURATION_S, MAP_TIMES_S, map_instants, published_maps,
-    repeats_published)
-from sonar_graph.evaluation.scores import ESTIMATES
+    repeats_published, rows_at)
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files, result_names
-from sonar_graph.evaluation.tables import (FITTED, HEADLINES, HEIGHTS, LABELS, RAW, SCORES, compact_table, headline_metric,
-    label, run_columns, score_keys, score_table, unaligned)
+from sonar_graph.evaluation.tables import (DIRECTIONS, ESTIMATES, FITTED, HEADLINES, HEIGHTS, RAW, SCORES, ScoreKind,
+    compact_table, headline_metric, label, run_columns, score_keys, score_table, scores_across, unaligned)
 __all__ = [
-    "Comparison", "DURATION_S", "ESTIMATES", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES",
-    "HEIGHTS", "LABELS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "RAW",
-    "RunResult", "SCORES", "Score", "aligned_to_truth", "anees_interval",
+    "Comparison", "DIRECTIONS", "DURATION_S", "ESTIMATES", "ErrorSeries", "FITTED", "GATED_SHARE", "HEADLINES",
+    "HEIGHTS", "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "RAW",
+    "RunResult", "SCORES", "Score", "ScoreKind", "aligned_to_truth", "anees_interval",
     "check_request", "compact_table", "compare", "describe_environment", "fixed",
     "format_value", "gathered", "headline_metric", "judge", "label", "landmark_errors", "likeness", "map_instants", "nis",
     "normalised_squares", "one_line", "published_maps", "read_comparison",
-    "repeats_published", "result_names", "rmse", "run_columns", "run_estimator", "run_here",
-    "score_keys", "score_table", "scored_map", "unaligned", "used_squares", "write_comparison",
+    "repeats_published", "result_names", "rmse", "rows_at", "run_columns", "run_estimator", "run_here",
+    "score_keys", "score_table", "scored_map", "scores_across", "unaligned", "used_squares", "write_comparison",
     "write_viewer_files", "yaw_rad",
 ]

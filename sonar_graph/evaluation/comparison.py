@@ -221,13 +221,11 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         if run.detections is not None:
             own |= detection_scores(run.detections)
     comparison = Comparison(sequence, instants_ns, runs, scores, errors, environment)
-    if not true:
-        environment["scored instants"] = (
-            "none: the log has no truth, so no trajectory error can be given"
-        )
-        return comparison
-    if not ended:
-        environment["scored instants"] = "none: no run has a pose"
+    if not true or not ended:
+        why = "no run has a pose"
+        if not true:
+            why = "the log has no truth, so no trajectory error can be given"
+        environment["scored instants"] = f"none: {why}"
         return comparison
     scored = scored_instants(instants_ns, true, runs)
     # a reader of the protocol must see that the truth was moved

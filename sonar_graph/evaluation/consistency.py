@@ -56,7 +56,7 @@ def error_series(
 
 def sigmas(variances: Floats) -> Floats:
     """Standard deviations; rounding below zero counts as zero."""
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def world_position_covs(trajectory: Trajectory) -> Floats:
@@ -65,7 +65,7 @@ def world_position_covs(trajectory: Trajectory) -> Floats:
     To first order ``mean @ Exp([theta, rho])`` has its origin at ``t + R rho``, so the covariance is ``R P_rho R^T``.
     """
     R = trajectory.matrices
-    return np.asarray(R @ trajectory.covariances[:, 3:, 3:] @ R.transpose(0, 2, 1))
+    return R @ trajectory.covariances[:, 3:, 3:] @ R.transpose(0, 2, 1)
 
 
 def yaw_variances(trajectory: Trajectory) -> Floats:
@@ -79,10 +79,8 @@ def yaw_variances(trajectory: Trajectory) -> Floats:
     # a vertical x axis has no heading: NaN is the answer, not a warning
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian[:, 1:] = R[:, 2, 1:] / (R[:, 0, 0] ** 2 + R[:, 1, 0] ** 2)[:, None]
-        return np.asarray(
-            np.einsum(
-                "ni,nij,nj->n", jacobian, trajectory.covariances[:, :3, :3], jacobian
-            )
+        return np.einsum(
+            "ni,nij,nj->n", jacobian, trajectory.covariances[:, :3, :3], jacobian
         )
 
 
@@ -96,7 +94,7 @@ def normalised_squares(errors: Floats, covs: Floats) -> Floats:
     >>> normalised_squares(np.array([[0.1, 0.0], [0.2, 0.2]]), np.array([0.01 * np.eye(2)] * 2))
     array([1., 8.])
     """
-    return np.asarray((normalised(errors, covs) ** 2).sum(axis=1))
+    return (normalised(errors, covs) ** 2).sum(axis=1)
 
 
 def normalised(errors: Floats, covs: Floats) -> Floats:
@@ -204,7 +202,7 @@ class Likeness(NamedTuple):
         that it has without (Bayley, Hammersley 1946).
         """
         rho = self.correlation
-        return np.asarray(np.sqrt(self.mean_square * (1.0 + rho) / (1.0 - rho)))
+        return np.sqrt(self.mean_square * (1.0 + rho) / (1.0 - rho))
 
 
 def likeness(log: DetectionLog) -> Likeness:

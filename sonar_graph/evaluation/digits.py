@@ -33,7 +33,9 @@ def format_value(value: float) -> str:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """The value with so many decimals; a zero has no sign."""
+    """The value with so many decimals, a dash for NaN; a zero has no sign."""
+    if math.isnan(value):
+        return ABSENT
     text = f"{value:.{decimals}f}"
     if float(text) == 0:
         text = text.lstrip("-")

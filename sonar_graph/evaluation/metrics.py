@@ -44,7 +44,7 @@ class Alignment:
 
     def apply(self, points: Floats) -> Floats:
         """Points moved into the truth's world, shape (n, 3)."""
-        return np.asarray(points @ self.rotation.T + self.translation)
+        return points @ self.rotation.T + self.translation
 
     def map(self, landmarks: LandmarkMap) -> LandmarkMap:
         """Landmarks moved into the truth's world, with their covariances."""
@@ -149,7 +149,7 @@ def yaw_rad(matrices: Floats) -> Floats:
     >>> np.degrees(yaw_rad(small_world().true_poses.rotations().as_matrix())[[0, -1]]).round(1)
     array([ 0. , 57.3])
     """
-    return np.asarray(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]))
+    return np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
 
 
 def aligned_errors_m(points: Floats, targets: Floats) -> Floats:
@@ -190,7 +190,7 @@ def relative_errors(
 
     def body_displacement(trajectory: Trajectory) -> Floats:
         step = trajectory.positions[second] - trajectory.positions[first]
-        return np.asarray(np.einsum("kji,kj->ki", trajectory.matrices[first], step))
+        return np.einsum("kji,kj->ki", trajectory.matrices[first], step)
 
     error_m = body_displacement(estimate) - body_displacement(truth)
     turned = wrap_angle(yaw_error[second] - yaw_error[first])
@@ -308,7 +308,7 @@ def align_map(
 
     def residuals() -> Floats:
         errors = alignment.apply(points) - targets
-        return np.asarray(np.linalg.norm(errors[:, :2], axis=1))
+        return np.linalg.norm(errors[:, :2], axis=1)
 
     half = (len(points) + 3) // 2
     for _ in range(CONCENTRATIONS):

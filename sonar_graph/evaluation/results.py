@@ -242,6 +242,15 @@ class Comparison:
         score = self.scores.get(name, {}).get(key)
         return None if score is None or math.isnan(score.value) else score
 
+    def errors_of(self, run: RunResult, kind: Kind = "causal") -> ErrorSeries | None:
+        """The errors of a run; None where it has none."""
+        return self.errors.get(run.estimator, {}).get(kind)
+
+    @property
+    def maps(self) -> list[LandmarkMap]:
+        """The final maps of the runs that have landmarks."""
+        return [run.landmarks for run in self.runs if run.landmarks]
+
     @property
     def failed_runs(self) -> list[RunResult]:
         """Runs that did not come to an end."""

@@ -6,6 +6,7 @@ Only calls of the estimator are timed. Results are checked before they are score
 import contextlib
 import copy
 import logging
+import math
 import sys
 import textwrap
 import time
@@ -80,23 +81,18 @@ class PeakMemory:
     """
 
     def __init__(self) -> None:
-        self._start_mb = float("nan")
-        try:
-            # a kernel without this file, or a container that forbids it, has no high-water mark to
-            # reset
+        self._start_mb = math.nan
+        # a kernel without this file, or a container that forbids it, has no high-water mark to reset
+        with contextlib.suppress(OSError):
             CLEAR_REFS.write_text(RESET_PEAK)
             self._start_mb = _status_mb("VmRSS")
-        except OSError:
-            return
 
     def rise_mb(self) -> float:
         """Megabytes (10⁶ bytes) at the peak above the start; NaN where the system does not measure it."""
-        return (
-            # caches that the system took back make the difference negative
-            max(_status_mb("VmHWM") - self._start_mb, 0.0)
-            if self._start_mb == self._start_mb
-            else float("nan")
-        )
+        if math.isnan(self._start_mb):
+            return math.nan
+        # caches that the system took back make the difference negative
+        return max(_status_mb("VmHWM") - self._start_mb, 0.0)
 
 
 def _status_mb(field: str) -> float:
@@ -104,7 +100,7 @@ def _status_mb(field: str) -> float:
     for line in STATUS.read_text().splitlines():
         if line.startswith(f"{field}:"):
             return int(line.split()[1]) * 1024 / 1e6
-    return float("nan")
+    return math.nan
 
 
 def check_outcome(
@@ -153,9 +149,8 @@ def _impossible(covs: Floats) -> Flags:
     size = np.abs(filled).max(axis=(1, 2), initial=0.0)
     asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     smallest = np.linalg.eigvalsh(filled)[:, 0]
-    sound = (
-        finite & (asymmetry <= 1e-6 * size) & (smallest >= -NEGATIVE_TOLERANCE * size)
-    )
+    is_symmetric = asymmetry <= 1e-6 * size
+    sound = finite & is_symmetric & (smallest >= -NEGATIVE_TOLERANCE * size)
     return np.asarray(~(unknown | sound))
 
 
@@ -480,15 +475,15 @@ class _Replay:
         peak_memory_mb = memory.rise_mb()
         detections = estimator.detections()
         self._stage = "at the end, outcome checked"
-        reasons = "; ".join(withheld_of(estimator))
+        known: dict[str, Any] = {
+            "refused": self._refused(estimator),
+            "peak_memory_mb": peak_memory_mb,
+        }
+        withheld = withheld_of(estimator)
+        reasons = "; ".join(withheld)
         if not self._estimates and reasons:
             # no fault of the estimator: it says what it lacks
-            return self._result(
-                "failed",
-                reasons,
-                refused=self._refused(estimator),
-                peak_memory_mb=peak_memory_mb,
-            )
+            return self._result("failed", reasons, **known)
         if not self._estimates:
             raise EvaluationError("process never returned an estimate")
         returned(smoothed, Trajectory, "trajectory()")
@@ -507,11 +502,10 @@ class _Replay:
             landmarks=landmarks,
             known_map=self._known_map(estimator, landmarks),
             detections=detections,
-            refused=self._refused(estimator),
-            withheld=withheld_of(estimator),
+            withheld=withheld,
             maps=self._maps,
             finish_s=finish_s,
-            peak_memory_mb=peak_memory_mb,
+            **known,
         )
 
     def _known_map(

@@ -75,6 +75,21 @@ PAGE = "report.html"
 RECOGNITION = "recognition.json"
 PICTURE_FOLDER = "recognised"
 ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv", "map.toml")
+# blocks of a sequence that are stored; of IMU and Doppler log the first and last rows, as all others are in the log
+IN_ARRAYS: dict[str, type[Any]] = {
+    "imu": Imu,
+    "dvl": Dvl,
+    "detections": LandmarkDetections,
+    "truth": Trajectory,
+    "true_landmarks": LandmarkMap,
+}
+# the same of a run
+IN_SERIES: dict[str, type[Any]] = {
+    "causal": Trajectory,
+    "smoothed": Trajectory,
+    "landmarks": LandmarkMap,
+    "detections": DetectionLog,
+}
 # types of what people may have edited in ``comparison.json``
 _SCORE = TypeAdapter(Score)
 _TEXTS = TypeAdapter(dict[str, str])
@@ -137,19 +152,12 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
 
 
 def _write(comparison: Comparison, folder: Path) -> None:
-    # all other rows of IMU and Doppler log are in the log
     sequence = comparison.sequence
     ends = np.array([0, -1])
     instants = comparison.instants_ns
-    blocks = {
-        "imu": sequence.imu.rows(ends),
-        "dvl": sequence.dvl.rows(ends),
-        "truth": sequence.truth,
-        "true_landmarks": sequence.true_landmarks,
-        "detections": sequence.detections,
-        "instants_ns": instants,
-    }
-    arrays = _packed(blocks)
+    blocks = {name: getattr(sequence, name) for name in IN_ARRAYS}
+    blocks |= {name: blocks[name].rows(ends) for name in ("imu", "dvl")}
+    arrays = _packed(blocks | {"instants_ns": instants})
     if sequence.truth is not None and np.isnan(sequence.truth.covariances).all():
         del arrays["truth.covariances"]  # they would be most of the file
     _write_arrays(folder / SEQUENCE, arrays)
@@ -201,15 +209,15 @@ def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
     if run.known_map is not None:
         write_map(folder / "map.toml", run.known_map)
     errors = comparison.errors.get(run.estimator, {})
-    blocks: dict[str, Any] = {"update_s": run.update_s}
-    for kind in KINDS:
-        blocks |= {kind: getattr(run, kind), f"errors.{kind}": errors.get(kind)}
+    blocks: dict[str, Any] = {
+        name: getattr(run, name) for name in ("update_s", *IN_SERIES)
+    }
+    blocks |= {f"errors.{kind}": errors.get(kind) for kind in KINDS}
     for number, known in enumerate(run.maps):
         place = f"maps.{number}"
         blocks |= {f"{place}.stamp_ns": known.stamp_ns, place: known.landmarks}
     for name in RefusedRow._fields:
         blocks[f"refused.{name}"] = [getattr(row, name) for row in run.refused]
-    blocks |= {"landmarks": run.landmarks, "detections": run.detections}
     _write_arrays(folder / SERIES, _packed(blocks))
 
 
@@ -297,13 +305,11 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         arrays = _read_arrays(folder / RUNS / name / SERIES)
         runs.append(_restore_run(name, entry, arrays))
         # JSON has no NaN, which was written as null
-        restored = {
-            key: _SCORE.validate_python(
-                score | ({"value": np.nan} if score["value"] is None else {})
-            )
-            for key, score in entry["scores"].items()
-        }
-        scores[name] = ByName(restored)
+        scores[name] = ByName()
+        for key, score in entry["scores"].items():
+            if score["value"] is None:
+                score["value"] = np.nan
+            scores[name][key] = _SCORE.validate_python(score)
         # without a truth no run has errors, not even none
         if len(of_sequence.get("truth.stamps_ns", ())):
             errors[name] = {
@@ -340,10 +346,7 @@ def _write_arrays(path: Path, arrays: Arrays) -> None:
     The archive is built in memory: writing it goes back to the head of each of many small entries.
     """
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, array, allow_pickle=False)
+    np.savez(content, **arrays)  # type: ignore[arg-type]  # the stubs take the arrays for its flags
     with replacing(path) as partial:
         partial.write_bytes(content.getbuffer())
 
@@ -369,26 +372,16 @@ def _restore_sequence(
     name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays
 ) -> Sequence:
     """A sequence with its start, end, detections and truth, but without its motion's measurements."""
-    imu = _unpack("imu", Imu, arrays)
-    dvl = _unpack("dvl", Dvl, arrays)
-    # start and end of the sequence are those of these rows
-    if imu is None or dvl is None:
-        raise EvaluationError(
-            "sequence.npz: the first and last rows of imu and dvl are missing"
-        )
     if "truth.stamps_ns" in arrays:
         unknown = np.full((len(arrays["truth.stamps_ns"]), 6, 6), np.nan)
         arrays = {"truth.covariances": unknown} | arrays
-    return Sequence(
-        name,
-        calibration,
-        imu,
-        dvl,
-        detections=_unpack("detections", LandmarkDetections, arrays),
-        truth=_unpack("truth", Trajectory, arrays),
-        true_landmarks=_unpack("true_landmarks", LandmarkMap, arrays),
-        notes=notes,
-    )
+    blocks = _unpack_all(IN_ARRAYS, arrays)
+    # start and end of the sequence are those of these rows
+    if blocks["imu"] is None or blocks["dvl"] is None:
+        raise EvaluationError(
+            "sequence.npz: the first and last rows of imu and dvl are missing"
+        )
+    return Sequence(name, calibration, **blocks, notes=notes)
 
 
 def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
@@ -408,10 +401,7 @@ def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
         entry["params"],
         _STATUS.validate_python(entry["status"]),
         str(entry["reason"]),
-        causal=_unpack("causal", Trajectory, arrays),
-        smoothed=_unpack("smoothed", Trajectory, arrays),
-        landmarks=_unpack("landmarks", LandmarkMap, arrays),
-        detections=_unpack("detections", DetectionLog, arrays),
+        **_unpack_all(IN_SERIES, arrays),
         refused=[
             RefusedRow(sensor, at_ns, Refusal(reason), distance)
             for sensor, at_ns, reason, distance in refused
@@ -434,6 +424,10 @@ def _packed(blocks: dict[str, Any]) -> Arrays:
         elif block is not None:
             arrays[name] = np.asarray(block)
     return arrays
+
+
+def _unpack_all(kinds: dict[str, type[Any]], arrays: Arrays) -> dict[str, Any]:
+    return {name: _unpack(name, kind, arrays) for name, kind in kinds.items()}
 
 
 def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-from typing import TYPE_CHECKING
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from sonar_graph.table import ABSENT, Cell, Column, Table, absent, number, words
 
@@ -23,75 +24,52 @@ NOT_ALIGNED = "not aligned"
 RAW = "ate_raw_m"
 AS_PUBLISHED = "as published"
 
-TRAJECTORY_LABELS = {
-    "ate_raw_m": "Position error, not aligned (ATE, RMS)",
-    "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
-    "ate_se2_m": "Horizontal position error, SE(2) aligned (ATE, RMS)",
-    "rpe_10s_m": "Drift over 10 s (RPE, RMS)",
-    "rpe_10s_rad": "Yaw drift over 10 s (RPE, RMS)",
-    "yaw_rmse_rad": "Yaw error (RMS)",
-    "nees_position": "Position NEES per degree of freedom",
-    "nees_yaw": "Yaw NEES",
-}
-SCORES = {
-    "causal": TRAJECTORY_LABELS
-    | {"own_map_m": "Horizontal position error on its own map as it was then (RMS)"},
-    "smoothed": TRAJECTORY_LABELS,
-    "landmarks": {
-        "raw_m": "Horizontal landmark error, not aligned (RMS)",
-        "se2_m": "Horizontal landmark error, SE(2) aligned (RMS)",
-        "count": "Landmarks mapped",
-        "nees": "Landmark NEES per degree of freedom",
-    },
-    "detections": {
-        "used": "Detections used",
-        "refused": "Detections refused",
-        "unnamed": "Detections of no landmark that is probable enough",
-        "nis": "NIS per degree of freedom",
-    },
-    "time": {
-        "update_median_ms": "Per update, median",
-        "update_p99_ms": "Per update, 99th percentile",
-        "update_max_ms": "Per update, longest",
-        "total_s": "Whole run",
-        "real_time_factor": "Real-time factor: log duration over run time",
-    },
-    "memory": {"peak_mb": "Peak memory added by the run"},
-}
-"""Label of every score, by the parts of its key before and after the point."""
-LABELS = {name: label for block in SCORES.values() for name, label in block.items()}
-BLOCKS = {
-    "causal": "Causal: what was known at each instant",
-    "smoothed": "Smoothed: what is known at the end about each instant",
-    "landmarks": "Landmarks",
-    "detections": "Detections",
-    "time": "Time",
-    "memory": "Memory",
-}
-HEADLINES = {
-    "ate_se2_m": "RMS after SE(2) alignment",
-    "ate_yaw_m": "RMS after alignment of yaw and translation",
-    "ate_raw_m": "RMS, not aligned",
-}
-"""Position errors that can stand in the headline, best suited first, with their names there."""
-# scores of the compact table after the errors of positions and map, most important first
-COMPACT = {
-    "causal.nees_position": "Position NEES",
-    "causal.nees_yaw": "Yaw NEES",
-    "causal.yaw_rmse_rad": "Yaw error",
-    "detections.nis": "NIS",
-    "detections.used": "Detections used",
-    "time.update_median_ms": "Update, median",
-    "time.update_max_ms": "Update, longest",
-}
-# scores that the compact table shows beside the name of the estimator
-MOST_SCORES = 5
 DIRECTIONS = {
     "lower": "lower is better",
     "higher": "higher is better",
     "inside": "1 is consistent",
     "none": "",
 }
+UNITS = {"m": "m", "rad": "rad", "ms": "ms", "s": "s", "mb": "MB"}
+"""Units by the ends of the names of scores."""
+
+
+@dataclass(frozen=True)
+class ScoreKind:
+    """One score, as ``scores.toml`` defines it for all runs."""
+
+    name: str
+    """Key without what it is a score of, such as ``ate_se2_m``."""
+    label: str
+    rule: str
+    """Sentence of the measuring rule, with values in braces."""
+    better: Literal["lower", "higher", "inside", "none"] = "lower"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the value, "1" for a number."""
+        return UNITS.get(self.name.rpartition("_")[2], "1")
+
+
+DEFINED = tomllib.loads(Path(__file__).with_name("scores.toml").read_text("utf-8"))
+BLOCKS: dict[str, str] = DEFINED["titles"]
+ESTIMATES: dict[str, str] = DEFINED["estimates"]
+HEADLINES: dict[str, str] = DEFINED["headlines"]
+
+
+def _defined_scores() -> dict[str, ScoreKind]:
+    found = {}
+    for block in BLOCKS:
+        shared = DEFINED["trajectory"] if block in ESTIMATES else {}
+        for name, kind in (shared | DEFINED.get(block, {})).items():
+            found[f"{block}.{name}"] = ScoreKind(name, **kind)
+    return found
+
+
+SCORES = _defined_scores()
+"""Every score by its key, in the order of tables."""
+# scores that the compact table shows beside the name of the estimator
+MOST_SCORES = 5
 
 
 def unaligned(sequence: Sequence) -> str:
@@ -100,21 +78,18 @@ def unaligned(sequence: Sequence) -> str:
     return "the truth brought into the estimates' world" if is_fitted else NOT_ALIGNED
 
 
-def label(metric: str, comparison: Comparison, labels: dict[str, str] = LABELS) -> str:
-    """Label of a score in a comparison, with what was brought where; ``labels``: or `HEADLINES`."""
-    return labels[metric].replace(NOT_ALIGNED, unaligned(comparison.sequence))
+def label(text: str, comparison: Comparison) -> str:
+    """Label or name in a headline of a score, with what was brought where in this comparison."""
+    return text.replace(NOT_ALIGNED, unaligned(comparison.sequence))
 
 
 def score_keys(comparison: Comparison) -> list[str]:
-    """All keys of scores in the order of the table: known ones as in `BLOCKS` and `LABELS`, then others by name."""
-    blocks = {name: place for place, name in enumerate(BLOCKS)}
-    metrics = {name: place for place, name in enumerate(LABELS)}
-
-    def place(key: str) -> tuple[float, float, str]:
-        block, _, metric = key.partition(".")
-        return blocks.get(block, math.inf), metrics.get(metric, math.inf), key
-
-    return sorted(set[str]().union(*comparison.scores.values()), key=place)
+    """All keys of scores in the order of the table: those of `SCORES`, then others by name."""
+    found = set[str]().union(*comparison.scores.values())
+    return [
+        *(key for key in SCORES if key in found),
+        *sorted(found.difference(SCORES)),
+    ]
 
 
 def headline_metric(comparison: Comparison) -> str | None:
@@ -156,37 +131,50 @@ def compact_table(comparison: Comparison, *, aligned: bool = True) -> Table:
         f"smoothed.{metric}": f"Smoothed, {world}",
     }
     headings[f"landmarks.{'se2_m' if aligned else 'raw_m'}"] = f"Map error, {world}"
-    columns = [Column("estimator", "Estimator", is_number=False)]
-    # whoever compares must see that a filter lacks what its neighbours have
-    rows = [
-        [
-            replace(
-                words(run.estimator, run=index),
-                note=AS_PUBLISHED if run.is_as_published else "",
-            )
-        ]
-        for index, run in enumerate(comparison.runs)
-    ]
-    for key, heading in (headings | COMPACT).items():
-        found = scores_of(comparison, key)
-        # a column of dashes takes the place of one with numbers
-        known = next(filter(None, found), None)
-        if known is None or len(columns) > MOST_SCORES:
-            continue
-        unit = f" ({known.shown_unit})" if known.shown_unit else ""
-        columns.append(Column(key, heading + unit))
-        for row, score in zip(rows, found, strict=True):
+    columns, cells = scores_across(
+        comparison, headings | DEFINED["compact"], most=MOST_SCORES
+    )
+    rows = []
+    for index, run in enumerate(comparison.runs):
+        # whoever compares must see that a filter lacks what its neighbours have
+        note = AS_PUBLISHED if run.is_as_published else ""
+        name = replace(words(run.estimator, run=index), note=note)
+        rows.append([name, *cells[index]])
+    caption = (
+        f"Position error: {label(HEADLINES[metric], comparison)}, causal. NEES 1: covariances fit."
+        if metric
+        else ""
+    )
+    columns = [Column("estimator", "Estimator", is_number=False), *columns]
+    return Table("compact", "Scores at a glance", caption, columns, rows)
+
+
+def scores_across(
+    comparison: Comparison,
+    headings: dict[str, str],
+    *,
+    most: int | None = None,
+    before_unit: str = " ",
+) -> tuple[list[Column], list[list[Cell]]]:
+    """Columns of the first scores with these headings that some run has, and below them the cells of each run.
+
+    The note of a cell is the verdict on a covariance that misfits.
+    """
+    # a column of dashes would take the place of one with numbers
+    known = {key: found for key in headings if any(found := scores_of(comparison, key))}
+    columns: list[Column] = []
+    rows: list[list[Cell]] = [[] for _ in comparison.runs]
+    for key in list(known)[:most]:
+        unit = next(filter(None, known[key])).shown_unit
+        heading = headings[key] + (f"{before_unit}({unit})" if unit else "")
+        columns.append(Column(key, heading))
+        for row, score in zip(rows, known[key], strict=True):
             if score is None:
                 row.append(absent())
                 continue
             verdict = "" if score.verdict == "consistent" else score.verdict
             row.append(number(score.value, score.text(), note=verdict))
-    caption = (
-        f"Position error: {label(metric, comparison, HEADLINES)}, causal. NEES 1: covariances fit."
-        if metric
-        else ""
-    )
-    return Table("compact", "Scores at a glance", caption, columns, rows)
+    return columns, rows
 
 
 def run_columns(comparison: Comparison) -> list[Column]:
@@ -216,7 +204,7 @@ def score_table(comparison: Comparison) -> Table:
     rows: list[list[Cell]] = []
     sections: dict[int, str] = {}
     for key in score_keys(comparison):
-        prefix, _, metric = key.partition(".")
+        prefix = key.partition(".")[0]
         block = BLOCKS.get(prefix, prefix)
         if block not in sections.values():
             sections[len(rows)] = block
@@ -227,7 +215,7 @@ def score_table(comparison: Comparison) -> Table:
         # one interval for all stands in the last column, others beside their values
         intervals = {_expected(score) for score in known}
         common = intervals.pop() if len(intervals) == 1 else ""
-        name = label(metric, comparison) if metric in LABELS else key
+        name = label(SCORES[key].label, comparison) if key in SCORES else key
         row = [words(name), words(known[0].shown_unit)]
         for score in scores:
             if score is None:

@@ -1,8 +1,9 @@
-"""Inputs that end and fit into memory, and JSON without NaN or infinity."""
+"""Inputs that end and fit into memory, TOML, and JSON without NaN or infinity."""
 
 import errno
 import json
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,33 @@ def text_of(path: Path, encoding: str = "utf-8") -> str:
     return path.read_text(encoding)
 
 
+def read_toml(path: Path, refusal: type[Exception]) -> dict[str, Any]:
+    """Content of a TOML file; ``refusal`` names the file where it cannot be read, or is not TOML."""
+    try:
+        text = text_of(path)
+    except OSError as error:
+        raise refusal(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise refusal(f"{path}: not TOML: {error}") from error
+    return parsed_toml(text, path, refusal)
+
+
+def parsed_toml(text: str, path: Path, refusal: type[Exception]) -> dict[str, Any]:
+    """Content of a text as TOML; ``refusal`` names the file that it comes from, and the way out."""
+    try:
+        return tomllib.loads(text)
+    # the parser recurses into nested arrays
+    except (ValueError, RecursionError) as error:
+        # a line of advice that was pasted into a file with a table of that name
+        is_twice = any(word in str(error) for word in ("twice", "overwrite", "mutate"))
+        advice = (
+            "; beside a table [imu], write `key = value` below it instead of `imu.key = value`, each key once"
+            if is_twice
+            else ""
+        )
+        raise refusal(f"{path}: not TOML: {error}{advice}") from error
+
+
 def spelt(text: str) -> str:
     """The same text with bytes of file names that are not UTF-8 spelt out, so that it can be written."""
     return text.encode("utf-8", "backslashreplace").decode()
@@ -48,21 +76,19 @@ def strict_json(content: dict[str, Any]) -> str:
     return json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """JSON object in a file.
-
-    Raises `EvaluationError` when the file is missing or is not a JSON object.
-    """
+def read_json(
+    path: Path,
+    refusal: type[Exception] = EvaluationError,
+    remedy: str = "write the comparison again",
+) -> dict[str, Any]:
+    """JSON object in a file; ``refusal`` names the file, and the remedy, where it is missing or holds anything else."""
     try:
         content = json.loads(text_of(path))
     except (OSError, ValueError, RecursionError) as error:
-        raise EvaluationError(
-            f"{path}: cannot be read as JSON ({error}); write the comparison again"
-        ) from error
+        raise refusal(f"{path}: cannot be read as JSON ({error}); {remedy}") from error
     if not isinstance(content, dict):
-        raise EvaluationError(
-            f"{path}: expected a JSON object, found {type(content).__name__}"
-        )
+        found = type(content).__name__
+        raise refusal(f"{path}: expected a JSON object, found {found}; {remedy}")
     return content
 
 

@@ -26,9 +26,7 @@ def _handling(
     Python objects of its results is sent again, and comes after them.
     """
     before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(
-        before
-    ):
+    if not callable(before):
         yield
         return
     usual: Callable[[int, FrameType | None], object] = before
@@ -39,11 +37,22 @@ def _handling(
         else:
             handle((number, frame), lambda: usual(number, frame))
 
-    signal.signal(signal.SIGINT, interrupt)
+    with _handler(interrupt, signal.SIGINT):
+        yield
+
+
+@contextmanager
+def _handler(
+    handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals
+) -> Iterator[None]:
+    """Handle signals in the block by a function; other threads than the main one have no handlers."""
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if is_main}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 def _send(thread: int, number: int) -> None:
@@ -94,16 +103,8 @@ def interrupt_event() -> Iterator[threading.Event]:
     Also in a process that a script began in the background, where Ctrl-C is otherwise ignored.
     """
     ended = threading.Event()
-    is_main = threading.current_thread() is threading.main_thread()
-    signals = (signal.SIGINT, signal.SIGTERM) if is_main else ()
-    before = {
-        number: signal.signal(number, lambda *_: ended.set()) for number in signals
-    }
-    try:
+    with _handler(lambda *_: ended.set(), signal.SIGINT, signal.SIGTERM):
         yield ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
@@ -132,14 +133,8 @@ def terminations_as_interrupts() -> Iterator[None]:
         handler = signal.getsignal(signal.SIGINT)
         (handler if callable(handler) else signal.default_int_handler)(number, frame)
 
-    if threading.current_thread() is not threading.main_thread():
+    with _handler(interrupt, signal.SIGTERM):
         yield
-        return
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def end_at_once(*_: object) -> None:

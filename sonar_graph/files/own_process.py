@@ -115,6 +115,11 @@ class OwnProcess:
             pass
         return answer
 
+    def ask(self, request: object) -> Any:
+        """Send a request; its answer, whenever it comes."""
+        self.send(request)
+        return self.answer()
+
     def end(self) -> None:
         """Kill the process and its children, which hold its pipe open."""
         with contextlib.suppress(ProcessLookupError):

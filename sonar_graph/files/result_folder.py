@@ -396,6 +396,18 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 @contextmanager
+def refused(
+    path: Path, refusal: type[SonarGraphError], advice: str = ""
+) -> Iterator[None]:
+    """Raise a ``refusal`` that names the path, and the advice, where the system does not let the block write."""
+    try:
+        yield
+    except OSError as error:
+        why = f"{path}: cannot be written: {error.strerror or error}"
+        raise refusal("; ".join(filter(None, [why, advice]))) from error
+
+
+@contextmanager
 def written_whole(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside ``path``, which replaces ``path`` when the block ends without an error.
 

@@ -123,11 +123,7 @@ class Arrivals:
             if sensor != "detections" and stamp_ns in self._stamps_ns[sensor]:
                 return REPEATED
             self._stamps_ns[sensor].add(stamp_ns)
-            waiting = self._waiting[sensor]
-            waiting.append(block)
-            # joining thousands of single rows at once would delay a step
-            if len(waiting) > MOST_PARTS:
-                waiting[:] = [joined(waiting)]
+            append(self._waiting[sensor], block)
             self._first_ns[sensor] = min(stamp_ns, self._first_ns.get(sensor, stamp_ns))
         self.newest_ns[sensor] = max(stamp_ns, self.newest_ns.get(sensor, stamp_ns))
         if arrival_ns is not None:
@@ -176,6 +172,14 @@ class Arrivals:
                 self._stamps_ns[name] = set(stamps_ns)
         self.done_ns = end_ns
         return Measurements(end_ns, **rows)
+
+
+def append(parts: list[Any], block: Any) -> None:
+    """Append a block to those of a sensor; of many blocks one is made."""
+    parts.append(block)
+    # joining thousands of single rows at once would delay a step
+    if len(parts) > MOST_PARTS:
+        parts[:] = [joined(parts)]
 
 
 def joined(parts: list[Any]) -> Any:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from sonar_graph.images import NO_DEPTH, NO_HEIGHT, SonarFrames
-from sonar_graph.live.arrivals import MOST_PARTS, joined
+from sonar_graph.live.arrivals import append, joined
 from sonar_graph.live.engine import Engine
 from sonar_graph.live.live_messages import Message, gather
 from sonar_graph.live.message_reader import Part
@@ -81,11 +81,8 @@ class LiveImages:
         for part in parts:
             is_of_use = part.role in ROLES and part.block is not None
             if is_of_use and part.stamp_ns > self._newest_ns[part.role]:
-                self._rows[part.role].append(part.block)
+                append(self._rows[part.role], part.block)
                 self._newest_ns[part.role] = part.stamp_ns
-        for role, blocks in self._rows.items():
-            if len(blocks) > MOST_PARTS:
-                self._rows[role] = [joined(blocks)]
         # images may come long before or after the other sensors
         if not self._topic:
             self._find(message)

@@ -70,11 +70,13 @@ def warm_recogniser() -> None:
     """Compile what a recogniser needs, on images of noise with a bright spot that moves."""
     from sonar_graph.devices import DEFAULT_DESIGNS
     from sonar_graph.recognition import RecognitionSession
+    from sonar_graph.sonar import Recogniser
 
     world = simulate_mission(MissionOptions(duration_s=6.0))
     noise = np.random.default_rng(0)
     # templates of a single design: drawing them takes longer than all that is compiled
-    session = RecognitionSession(world, DEFAULT_DESIGNS[:1], pictures=False)
+    recogniser = Recogniser(world.calibration, DEFAULT_DESIGNS[:1])
+    session = RecognitionSession(world, recogniser)
     ranges_m = np.linspace(0.5, 10.0, BINS)
     azimuths_rad = np.linspace(1.0, -1.0, BEAMS)
     for k, stamp_ns in enumerate(world.instants(4.0)[2:]):
@@ -100,9 +102,7 @@ def _answer(request: Any, _: Tell) -> object:
 
         recogniser = Recogniser(request.sequence.calibration)
         recogniser.prepare(request.frame)
-        _Recogniser.session = RecognitionSession(
-            request.sequence, recogniser=recogniser, pictures=False
-        )
+        _Recogniser.session = RecognitionSession(request.sequence, recogniser)
         gc.freeze()  # templates are never looked at again, which would delay an image
         return READY
     session = _Recogniser.session
@@ -176,11 +176,11 @@ class SonarWorker:
     def _work(self) -> None:
         try:
             self._process.answer()  # that it is ready
-            self._ask(WARM_UP)
+            self._process.ask(WARM_UP)
             self.is_warm.set()
             with self._changed:
                 self._changed.wait_for(lambda: self._begin or self._is_ended)
-            self._ask(self._begin)
+            self._process.ask(self._begin)
             self.has_begun.set()
             while True:
                 with self._changed:
@@ -188,7 +188,7 @@ class SonarWorker:
                     if self._is_ended:
                         return
                     one = self._waiting.pop(0)
-                answer = self._ask(one.rows)
+                answer = self._process.ask(one.rows)
                 if isinstance(answer, SonarAnswer):
                     self._seen(answer)
         except Exception as error:  # of the process, or because it was ended
@@ -196,7 +196,3 @@ class SonarWorker:
         finally:
             self.is_warm.set()
             self.has_begun.set()
-
-    def _ask(self, request: object) -> Any:
-        self._process.send(request)
-        return self._process.answer()

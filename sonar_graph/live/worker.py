@@ -181,7 +181,7 @@ class Worker:
         steps = list(warm_up.replay(warm_up.instants(options.rate_hz)))
         # what is compiled or loaded at the first use must not delay the first pose
         for request in (self._begin(warm_up.calibration), steps, FINISH):
-            self._ask(request)
+            self._process.ask(request)
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def begin(self, calibration: Calibration) -> None:
@@ -193,10 +193,6 @@ class Worker:
             self._changed.notify()
         if not self._thread.ident:
             self._thread.start()
-
-    def _ask(self, request: object) -> Any:
-        self._process.send(request)
-        return self._process.answer()
 
     @property
     def waiting(self) -> int:
@@ -225,7 +221,7 @@ class Worker:
         self._thread.join()
         if self.error is not None:
             raise self.error
-        outcome: LiveOutcome = self._ask(FINISH)
+        outcome: LiveOutcome = self._process.ask(FINISH)
         return outcome
 
     def end(self) -> None:
@@ -245,10 +241,10 @@ class Worker:
                     del self._waiting[:MOST_AT_ONCE]
                 # a run that begins again forgets the steps of the one before
                 if begin is not None:
-                    self._ask(begin)
+                    self._process.ask(begin)
                 if steps:
                     # outside the lock: steps may be added while the estimator works
-                    answer = self._ask(steps)
+                    answer = self._process.ask(steps)
                     self._is_catching_up &= bool(self._waiting)
                     if self._begins is None:  # else it is of a run that is over
                         self._answered(answer)

@@ -99,18 +99,15 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     # the recorder's clock is the only other one that a log has
     lag_ns = log_times_ns - stamps_ns
     typical_s = float(np.median(lag_ns)) / 1e9
+    side = "before" if typical_s > 0 else "after"
     if abs(typical_s) > DAY_S:
-        side = "before" if typical_s > 0 else "after"
         yield f"stamped {abs(typical_s) / DAY_S:.0f} days {side} recording: a log was played, or a clock was not set"
     elif abs(typical_s) > LARGEST_LAG_S:
-        side = "before" if typical_s > 0 else "after"
         yield f"stamped {abs(typical_s):.4g} s {side} recording: another clock, or a delay"
     # medians of some messages: a single late one is no drift
-    first_s, last_s = (
-        float(np.median(part)) / 1e9 for part in (lag_ns[:20], lag_ns[-20:])
-    )
-    if abs(last_s - first_s) > LARGEST_LAG_CHANGE_S:
-        yield f"{DRIFTING} by {abs(last_s - first_s):.3g} s: a clock jumped or runs wrong"
+    drift_s = abs(np.median(lag_ns[-20:]) / 1e9 - np.median(lag_ns[:20]) / 1e9)
+    if drift_s > LARGEST_LAG_CHANGE_S:
+        yield f"{DRIFTING} by {drift_s:.3g} s: a clock jumped or runs wrong"
 
 
 def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
@@ -240,7 +237,7 @@ def gravity_warning(
     if not len(measured):
         return None
     # the median forgets manoeuvres, which the mean keeps
-    typical = mounting.pose().rotation().matrix() @ np.median(measured, axis=0)
+    typical = mounting.rotation_matrix() @ np.median(measured, axis=0)
     length = float(np.linalg.norm(typical))
     size = float(np.median(np.linalg.norm(measured, axis=1)))
     is_gravity = abs(size - gravity_m_s2) < MOST_OFF_GRAVITY * gravity_m_s2
@@ -547,7 +544,7 @@ def stuck_warning(
 
 def differing(values: NDArray[Any]) -> Mask:
     """True for each row but the first, shape (n - 1,), that differs from the row before."""
-    return np.asarray(np.any(values[1:] != values[:-1], axis=1))
+    return np.any(values[1:] != values[:-1], axis=1)
 
 
 class Runs(NamedTuple):
@@ -570,13 +567,11 @@ class Runs(NamedTuple):
 
     def span(self, values: NDArray[Any]) -> NDArray[Any]:
         """Change of values, shape (n,), from the first row of each run to its last, shape (k,)."""
-        return np.asarray(values[self.last] - values[self.first])
+        return values[self.last] - values[self.first]
 
     def are_long(self, stamps_ns: Ints, seconds: float, fewest: int) -> Mask:
         """Runs that last longer and have at least so many rows, shape (k,)."""
-        return np.asarray(
-            (self.span(stamps_ns) > seconds * 1e9) & (self.rows >= fewest)
-        )
+        return (self.span(stamps_ns) > seconds * 1e9) & (self.rows >= fewest)
 
     def may_be_chance(self) -> Mask:
         """Runs whose number of repeated rows comes by chance once in a thousand logs of a coarse sensor, shape (k,)."""
@@ -585,7 +580,7 @@ class Runs(NamedTuple):
             return np.zeros(1, bool)
         n = int(self.last[-1]) + 1
         share = 1.0 - changes / (n - 1)
-        return np.asarray(n * share ** (self.rows - 1) >= 1e-3)
+        return n * share ** (self.rows - 1) >= 1e-3
 
     def mask(self, chosen: Mask) -> Mask:
         """Rows of the chosen runs, shape (n,)."""
@@ -672,7 +667,7 @@ def unfelt_zeros(imu: Imu, dvl: Dvl, calibration: Calibration) -> Mask:
     gravity. A line through the rows on one side of the zeros predicts -F at the first of them. At rest the prediction
     holds; without bottom lock it is off by the velocity.
     """
-    is_zero: Mask = np.asarray(~dvl.velocity.any(axis=1))
+    is_zero = np.asarray(~dvl.velocity.any(axis=1))
     runs = Runs.of(is_zero[1:] != is_zero[:-1])
     chosen = is_zero[runs.first]
     for run in np.flatnonzero(chosen).tolist():
@@ -818,17 +813,14 @@ def way_by(
     if role == "heading":
         stamps_ns = imu.stamps_ns
         # yaw rate: the world's vertical is the body's z while it is near level
-        rate = (
-            imu.angular_velocity
-            @ calibration.imu.mounting.pose().rotation().matrix()[2]
-        )
+        rate = imu.angular_velocity @ calibration.imu.mounting.rotation_matrix()[2]
     else:
-        whole = np.isfinite(dvl.velocity).all(axis=1) & ~is_partial(dvl.velocity_cov)
+        whole = ~is_partial(dvl.velocity_cov)
         if not whole.any():
             return np.zeros(len(at_ns))
-        rows = dvl.rows(np.flatnonzero(whole))
+        rows = dvl.rows(whole)
         stamps_ns = rows.stamps_ns
-        velocity = rows.velocity @ calibration.dvl.mounting.pose().rotation().matrix().T
+        velocity = rows.velocity @ calibration.dvl.mounting.rotation_matrix().T
         step_ns = float(np.median(np.diff(stamps_ns))) if len(rows) > 1 else np.inf
         width = min(max(1, round(1e9 / step_ns)), len(rows))
         # without averaging, noise adds up to a distance that was not moved

@@ -73,7 +73,7 @@ class FirstPath:
         t_hole = np.append(t[:-1][np.diff(t) > LONGEST_HOLE_S], LONGEST_S)
         rows = (t >= -1.0) & (t <= t_hole[t_hole > 0][0])
         t = t[rows]
-        body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        body_R_imu = calibration.imu.mounting.rotation_matrix()
         rate = (
             imu.angular_velocity[rows] - calibration.imu.gyro_bias_rad_s
         ) @ body_R_imu.T
@@ -84,12 +84,10 @@ class FirstPath:
         unbiased = imu.specific_force[rows] - calibration.imu.accel_bias_m_s2
         force = np.einsum("nij,nj->ni", C, unbiased @ body_R_imu.T)
         seconds = (dvl.stamps_ns - start_ns) * 1e-9
-        is_inside = (
-            (seconds >= 0) & (seconds <= t[-1]) & np.isfinite(dvl.velocity).all(axis=1)
-        )
+        is_inside = (seconds >= 0) & (seconds <= t[-1])
         seconds = seconds[is_inside]
         at = C[np.searchsorted(t, seconds, side="right") - 1]
-        body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+        body_R_dvl = calibration.dvl.mounting.rotation_matrix()
         velocity = np.einsum("nij,nj->ni", at, dvl.velocity[is_inside] @ body_R_dvl.T)
         impulse = columns_at(seconds, t, running_integral(t, force))
         return cls(seconds, velocity, impulse)
@@ -168,7 +166,6 @@ def measured_start(
 ) -> tuple[Start, list[str]]:
     """Start by the first rows, and what was not measured as it should be."""
     start = calibration.start
-    changes = dict[str, Any]()
     notes = list[str]()
     path = FirstPath.of(blocks["imu"], blocks["dvl"], calibration, start_ns)
     roll, pitch, yaw = start.rpy_rad
@@ -204,8 +201,6 @@ def measured_start(
             (fixes.stamps_ns - start_ns) * 1e-9, fixes.position_m, path, world_R_level
         )
         notes.append("heading by the path of the fixes")
-    changes["rpy_rad"] = (roll, pitch, yaw)
-    changes["rpy_sigma_rad"] = sigmas
     R = gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix()
     position = np.array(start.position_m)
     position_sigma = np.array(start.position_sigma_m)
@@ -230,8 +225,12 @@ def measured_start(
         )
     elif fixes is None and calibration.planar is None:
         notes.append("no depth")
-    changes["position_m"] = position
-    changes["position_sigma_m"] = position_sigma
+    changes: dict[str, Any] = {
+        "rpy_rad": (roll, pitch, yaw),
+        "rpy_sigma_rad": sigmas,
+        "position_m": position,
+        "position_sigma_m": position_sigma,
+    }
     rounded = {
         name: tuple(round(float(value), 4) for value in values)
         for name, values in changes.items()
@@ -248,13 +247,13 @@ def _turned(
 ) -> Floats:
     """Turn by the gyros about the vertical at the start until some instants, shape (n,), rad."""
     level_R_body = Rotation.from_euler("ZYX", [0.0, tilt_rad[1], tilt_rad[0]])
-    body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+    body_R_imu = calibration.imu.mounting.rotation_matrix()
     rate = (imu.angular_velocity - calibration.imu.gyro_bias_rad_s) @ body_R_imu.T
     about_up = np.asarray(rate @ level_R_body.as_matrix()[2], np.float64)
     seconds = np.asarray((imu.stamps_ns - start_ns) * 1e-9, np.float64)
     turn = running_integral(seconds, about_up)
     at = np.interp(at_ns, imu.stamps_ns, turn)
-    return np.asarray(at - np.interp(start_ns, imu.stamps_ns, turn))
+    return at - np.interp(start_ns, imu.stamps_ns, turn)
 
 
 def height_by_depth(

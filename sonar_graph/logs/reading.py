@@ -87,7 +87,7 @@ from sonar_graph.logs.vehicle_setup import (
     static_frames,
     unplaced,
 )
-from sonar_graph.measurements import Block, Dvl, Floats, Imu
+from sonar_graph.measurements import Block, Dvl, Imu
 from sonar_graph.sequence import Sequence
 
 LOG = logging.getLogger("sonar_graph.logs")
@@ -424,7 +424,7 @@ class Assembly:
                 text = f"{count} of {len(rows)} rows {reason}: left out{advice}"
                 self._left_out[role] = text
                 dropped = dropped | {reason: count}
-                rows = rows.rows(np.flatnonzero(~is_wrong))
+                rows = rows.rows(~is_wrong)
         self._blocks[role] = rows
         if dropped := self.topics[role].unsound | dropped:
             self._dropped[role] = dropped
@@ -466,20 +466,18 @@ class Assembly:
         """What reading a role needs beside its messages."""
         body_R_sensor = np.eye(3)
         if role == "heading":
-            body_R_sensor = self._heading_mounting().pose().rotation().matrix()
+            mounting: Mounting | None = self.calibration.imu.mounting
+            # an orientation of another topic than the IMU's is of the sensor of its frame
+            if self.topics[role] is not self.topics.get("imu"):
+                frame = self.adapters[role].frame_in(self._tables[role].groups)
+                mounting = mounting_of(frame, static_frames(self._recording))
+            body_R_sensor = (mounting or Mounting()).rotation_matrix()
         origin = None
         if role in ("positions", "truth"):
             origin, said = common_origin(role, self.adapters, self._tables)
             if said:
                 self._notes["log.origin"] = said
         return Setup(self.calibration, body_R_sensor, origin)
-
-    def _heading_mounting(self) -> Mounting:
-        """Mounting of the sensor of an orientation: the IMU's where it is its topic, else that of its frame."""
-        if self.topics["heading"] is self.topics.get("imu"):
-            return self.calibration.imu.mounting
-        frame = self.adapters["heading"].frame_in(self._tables["heading"].groups)
-        return mounting_of(frame, static_frames(self._recording)) or Mounting()
 
     def sequence(self, name: str | None = None) -> Sequence:
         """Everything that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
@@ -656,22 +654,6 @@ def common_origin(
     of_fixes = (latitude_deg, longitude_deg, math.nan)
     text += "; depths give the height, not the fixes, without `origin_deg_m` in geodetic under [positions]"
     return of_fixes if role == "positions" else origin, text
-
-
-def rows_of(
-    adapter: Any,
-    source: Any,
-    calibration: Calibration,
-    body_R_sensor: Floats,
-    origin: Origin | None,
-) -> tuple[Any, Dropped]:
-    """Rows of a table of messages, or of a topic where the adapter reads that, and the numbers left out by reason.
-
-    ``body_R_sensor`` is of the sensor of an orientation; ``origin`` of the world, in degrees and metres.
-    """
-    setup = Setup(calibration, body_R_sensor, origin)
-    found: tuple[Any, Dropped] = adapter.read(source, setup)
-    return found
 
 
 def _counts(dropped: Dropped) -> str:

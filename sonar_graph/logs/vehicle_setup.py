@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,8 @@ from pydantic import ValidationError
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import CalibrationError, LogError
-from sonar_graph.files import as_path, text_of
+from sonar_graph.files import as_path, read_json, read_toml
+from sonar_graph.logs.adapters import ADAPTERS
 from sonar_graph.logs.cdr import (
     Bytes,
     Value,
@@ -225,6 +225,11 @@ class PartialCalibration:
                     for role in ("depth", "heading", "positions")
                     if values.get(role) is False
                 )
+                for fault in faults:
+                    if _is_of_log_config(fault["loc"]):
+                        field = ".".join(map(str, fault["loc"]))
+                        what = "is a key of a log configuration, not of a calibration: give it with --log-config"
+                        raise CalibrationError(f"{source}: {field} {what}") from error
                 raise CalibrationError(
                     f"{source}: {faults_in(error, Calibration)}{advice}"
                 ) from error
@@ -246,19 +251,11 @@ class PartialCalibration:
                     f"{path}: the log has no calibration; give one that was written by sonar-graph"
                 )
             return cls(recorded, str(path))
-        kind = "JSON" if path.suffix == ".json" else "TOML"
-        try:
-            text = text_of(path)
-            values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
-        except OSError as error:
-            raise CalibrationError(
-                f"{path}: cannot be read: {error.strerror}"
-            ) from error
-        except (ValueError, RecursionError) as error:
-            raise CalibrationError(f"{path}: not {kind}: {error}") from error
-        if not isinstance(values, dict):
-            what = "expected an object with sections such as imu"
-            raise CalibrationError(f"{path}: {what}, not {json.dumps(values):.40}")
+        if path.suffix == ".json":
+            remedy = 'give sections, such as {"imu": {"gyro_noise_density": 1e-4}}'
+            values = read_json(path, CalibrationError, remedy)
+        else:
+            values = read_toml(path, CalibrationError)
         for field in OTHER_FILES.keys() & values.keys():
             fault = f"is not a calibration; give it with {OTHER_FILES[field]}"
             raise CalibrationError(f"{path}: {fault}")
@@ -274,6 +271,19 @@ class PartialCalibration:
         """Source of a calibration whose fields here go before those of another source."""
         given = ", ".join(_paths(self.values))
         return f"from {self.source}: {given or 'nothing'}; else {source}"
+
+
+def _is_of_log_config(place: tuple[int | str, ...]) -> bool:
+    """True of a field that no calibration has, where a log configuration has a key of its name."""
+    if len(place) != 2:
+        return False
+    adapter = ADAPTERS.get(str(place[0]))
+    section = Calibration.model_fields.get(str(place[0]))
+    if adapter is None or section is None:
+        return False
+    key = str(place[1])
+    own = getattr(section.annotation, "model_fields", {})
+    return key in adapter.model_fields and key not in own
 
 
 def as_calibration(

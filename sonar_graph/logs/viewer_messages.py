@@ -24,11 +24,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.logs.adapters import body_to_ros
-from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
 from sonar_graph.logs.trajectory_files import write_text
-from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing, stamped
+from sonar_graph.logs.writing import (
+    WORLD_FRAME,
+    Columns,
+    fields,
+    header,
+    outgoing,
+    stamped,
+)
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.states import LandmarkMap, Trajectory
@@ -129,7 +135,7 @@ def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> O
         (*colour[:3], _FAINT),
     )
     # one marker in each message
-    values: dict[str, Value] = {
+    values: Columns = {
         path: value[:, None] if isinstance(value, np.ndarray) else value
         for path, value in columns.items()
     }
@@ -143,7 +149,7 @@ def _marker_columns(
     quaternions: Floats,
     sizes_m: Floats,
     colour: Colour,
-) -> dict[str, Value]:
+) -> Columns:
     """Fields of markers, a row each, in the world."""
     values = header(stamps_ns, WORLD_FRAME, "markers.header")
     values |= fields("markers.pose.position", "xyz", positions)
@@ -172,7 +178,7 @@ def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
         stamps_ns = np.array([picture.stamp_ns])
         # pictures differ in their size, so that each is an entry
         content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
-        values: dict[str, Value] = {"format": "jpeg", "data": content}
+        values: Columns = {"format": "jpeg", "data": content}
         lengths = {"data": content.shape[1]}
         messages.append(
             stamped(topic, COMPRESSED_IMAGE, stamps_ns, "sonar", values, lengths)

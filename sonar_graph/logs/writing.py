@@ -58,6 +58,8 @@ WORLD_FRAME = "map"
 NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
 """Covariance by which ROS marks values as not measured."""
 _SECONDS = np.iinfo(np.int32)
+Columns = dict[str, Value]
+"""Columns of messages by the paths of their fields."""
 
 
 def write_log(
@@ -135,7 +137,7 @@ def imu_messages(topic: str, imu: Imu) -> Outgoing:
     """``sensor_msgs/Imu`` without orientation."""
     # ROS marks an acceleration that was not measured by -1 in its covariance
     unmeasured = np.isnan(imu.specific_force).all(axis=1)
-    values: dict[str, Value] = {
+    values: Columns = {
         # not measured, but a quaternion of zeros is invalid and viewers refuse it
         "orientation.w": 1.0,
         "orientation_covariance": NOT_MEASURED[None, :],
@@ -186,7 +188,7 @@ def _upright_poses(
     topic: str, stamps_ns: Ints, values: Mapping[str, Value], covariances: Floats
 ) -> Outgoing:
     """Poses without a turn, measured in part; covariances of shape (n, 6, 6)."""
-    pose: dict[str, Value] = {
+    pose: Columns = {
         "pose.pose.orientation.w": 1.0,
         "pose.covariance": covariances.reshape(-1, 36),
     }
@@ -225,7 +227,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
     return entries
 
 
-def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
+def pose_columns(trajectory: Trajectory) -> Columns:
     """Columns of a ``PoseWithCovariance`` called ``pose``, with zeros for an unknown covariance."""
     # covariances are in body axes here, in world axes in ROS
     covariances = body_to_ros(trajectory.covariances, trajectory.matrices)
@@ -330,7 +332,7 @@ def sonar_image_messages(
     return stamped(topic, SONAR_IMAGE, frames.stamps_ns, "sonar", values, lengths)
 
 
-def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
+def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> Columns:
     """Columns of a message's header.
 
     Raises `LogError` when a stamp lies outside what ROS 2 can express (years 1901 to 2038).
@@ -350,7 +352,7 @@ def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, 
     }
 
 
-def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:
+def fields(prefix: str, names: str, columns: Floats) -> Columns:
     """Fields from columns side by side: ``fields("velocity", "xyz", v)``."""
     return {f"{prefix}.{name}": columns[..., i] for i, name in enumerate(names)}
 

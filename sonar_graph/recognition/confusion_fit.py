@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import (
     EVIDENCE,
     SHIPPED,
+    Accuracy,
     Confusion,
     IdentityParams,
     ObjectSighting,
@@ -36,7 +38,6 @@ from sonar_graph.sonar import (
     TrackInFrame,
     confusion_for,
     mark_of,
-    posterior_mean_rows,
     read_confusion,
     soft_scores,
 )
@@ -49,6 +50,8 @@ LEAST_FRAMES = 3
 """Labelled frames from which a class is measured."""
 LEAST_FOR_ENDS = 40
 """So many tracks have one beyond each end of the range that holds 95 %."""
+JEFFREYS = 0.5
+"""Prior count of each feature of the confusion matrix."""
 PRIOR_SHARE = 0.25
 """Standard deviation of what is fitted about the shipped model, as a share of it; of looks, of their logarithm."""
 
@@ -77,30 +80,6 @@ class LabelledFits:
     """Stamp of each frame, shape (n,)."""
 
 
-class Accuracy(NamedTuple):
-    """Standard deviations along the ray and across it, as they grow with the bounds of a fit."""
-
-    usual_m: Floats
-    """Usual bounds, shape (2,)."""
-    usual_sigmas_m: Floats
-    """Standard deviations at these, shape (2,)."""
-    power: float
-
-    @classmethod
-    def of(cls, model: Confusion) -> Accuracy:
-        """Accuracy of a measured model."""
-        usual_m = np.array([model.range_bound_m, model.across_bound_m])
-        return cls(
-            usual_m,
-            np.array([model.range_sigma_m, model.across_sigma_m]),
-            model.bound_power,
-        )
-
-    def sigmas_m(self, bound_m: Floats) -> Floats:
-        """Standard deviations at bounds, shape (..., 2)."""
-        return self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power
-
-
 class TrueObjects(NamedTuple):
     """Landmarks where they truly are, in the sonar's axes."""
 
@@ -126,14 +105,11 @@ class TrueObjects(NamedTuple):
 class LabelledSighting(NamedTuple):
     """Row of `LabelledFits`; its track with the number of its log."""
 
-    evidence: Floats
-    bound_m: Floats
-    moved_m: Floats
+    sighting: ObjectSighting
     label: int
     track: tuple[int, int]
     independent_share: float
     error_m: tuple[float, float]
-    range_per_height: float
     stamp_ns: int
 
 
@@ -151,9 +127,6 @@ class LabelledSightings:
         sighting = track.sighting
         if sighting is None or sighting.fit is None:
             return
-        # the accuracy is a function of the bounds, which this fit lacks
-        if sighting.bound_m is None or sighting.moved_m is None:
-            return
         label, at = truth.label_of(sighting)
         is_landmark = label != NONE
         if label == NO_LABEL or (is_landmark and label not in self.ids):
@@ -165,14 +138,11 @@ class LabelledSightings:
             error_m = (sighting.range_m - range_m, range_m * turned)
         self._rows.append(
             LabelledSighting(
-                evidence=sighting.fit.evidence,
-                bound_m=sighting.bound_m,
-                moved_m=sighting.moved_m,
+                sighting=sighting,
                 label=self.ids.index(label) if is_landmark else len(self.ids),
                 track=(log, track.id),
                 independent_share=track.independent_share,
                 error_m=error_m,
-                range_per_height=sighting.range_per_height,
                 stamp_ns=stamp_ns,
             )
         )
@@ -184,19 +154,19 @@ class LabelledSightings:
     def fits(self) -> LabelledFits:
         """All of them as columns."""
 
-        def column(name: str, *shape: int) -> Floats:
-            return np.reshape([getattr(row, name) for row in self._rows], (-1, *shape))
+        def column(path: str, *shape: int) -> Floats:
+            return np.reshape(list(map(attrgetter(path), self._rows)), (-1, *shape))
 
         _, track = np.unique(column("track", 2), axis=0, return_inverse=True)
         return LabelledFits(
-            evidence=column("evidence", len(self.ids), len(EVIDENCE)),
-            bound_m=column("bound_m", 2),
-            moved_m=column("moved_m", 2),
+            evidence=column("sighting.fit.evidence", len(self.ids), len(EVIDENCE)),
+            bound_m=column("sighting.bound_m", 2),
+            moved_m=column("sighting.moved_m", 2),
             label=column("label").astype(np.int64),
             track=track.ravel(),
             independent_share=column("independent_share"),
             error_m=column("error_m", 2),
-            range_per_height=column("range_per_height"),
+            range_per_height=column("sighting.range_per_height"),
             stamp_ns=column("stamp_ns").astype(np.int64),
         )
 
@@ -270,10 +240,10 @@ def calibrate(
                 "give the designs of the log's landmarks with --designs (designs in Python)"
             )
         recogniser = Recogniser(run.calibration, designs, params)
-        session = RecognitionSession(run, recogniser=recogniser, pictures=False)
+        session = RecognitionSession(run, recogniser)
         first_ns = run.true_poses.stamps_ns[0]
         last_ns = run.true_poses.stamps_ns[-1]
-        for result in session.run(
+        for _, result in session.run(
             read_sonar_frames(path, topic, config, salvage=salvage)
         ):
             stamp_ns = result.stamp_ns
@@ -333,7 +303,7 @@ def estimate_confusion(
     is_left_out = is_moved & (is_moved.sum() < np.isfinite(error).all(axis=1).sum())
     # these err by what moved them, too
     counted = np.where(is_left_out[:, None], np.nan, error)
-    found = accuracy(counted, fits.bound_m, fits.track, Accuracy.of(shipped))
+    found = accuracy(counted, fits.bound_m, fits.track, shipped.accuracy)
     sigmas_m = np.hypot(found.sigmas_m(fits.bound_m), fits.moved_m)
     range_sigma_m, across_sigma_m = found.usual_sigmas_m.tolist()
     range_bound_m, across_bound_m = found.usual_m.tolist()
@@ -488,11 +458,14 @@ def report_interval_s(
 def confusion_rows(scores: Floats, label: Ints, trials: Ints) -> Floats:
     """Confusion matrix from the soft scores of frames, for classes with these numbers of trials.
 
-    Frames of a track repeat each other, so that tracks are the trials, not frames.
+    Its rows are posterior means under Jeffreys' Dirichlet prior, ``C[k, j] = (n_k m_kj + 1/2) / (n_k + features / 2)``
+    with the mean scores m of n_k independent trials of class k: a confusion that never happened in n trials keeps about
+    1 / 2n. Frames of a track repeat each other, so that tracks are the trials, not frames.
     """
     sums = np.array([scores[label == k].sum(axis=0) for k in range(scores.shape[1])])
     means = sums / np.maximum(np.bincount(label, minlength=len(sums)), 1)[:, None]
-    return posterior_mean_rows(means, trials)
+    n = trials[:, None]
+    return (n * means + JEFFREYS) / (n + JEFFREYS * len(sums))
 
 
 def fit_weights(

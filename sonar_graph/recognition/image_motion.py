@@ -25,6 +25,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError
 from sonar_graph.images import SonarFrames, decibels
 from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.recognition.sonar_motion import OUT_OF_ORDER
 from sonar_graph.sonar import (
     SLANT_PLANE,
     FloorView,
@@ -255,13 +256,10 @@ class ImageMotions:
         """Number of steps that were measured, and of all."""
         self._stamp_ns: int | None = None
 
-    def covers(self, stamp_ns: int) -> bool:
-        """True for an instant after the last frame."""
-        return not self.passed(stamp_ns)
-
-    def passed(self, stamp_ns: int) -> bool:
-        """True for an instant before that of the last frame, or at it."""
-        return self._stamp_ns is not None and stamp_ns < self._stamp_ns
+    def refusal(self, stamp_ns: int) -> str:
+        """Reason not to use a frame: it is from before the last one; empty without."""
+        is_late = self._stamp_ns is not None and stamp_ns < self._stamp_ns
+        return OUT_OF_ORDER if is_late else ""
 
     def add(self, frame: SonarFrames) -> PlanarStep | None:
         """Lay a block of one frame upon the frame before."""

@@ -18,7 +18,7 @@ it exceeds their own. Errors of the motion that carries a place add to the model
 
 import csv
 import json
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,6 +51,7 @@ from sonar_graph.sonar import (
     Recogniser,
     RecogniserParams,
     TrackInFrame,
+    with_lens,
 )
 
 COLUMNS = ("stamp_ns", "range_m", "azimuth_rad", "id")
@@ -317,21 +318,14 @@ def _labelled_tracks(
     log: LabelledLog, recogniser: Recogniser, blocks: Iterable[SonarFrames]
 ) -> tuple[dict[int, LabelledTrack], dict[str, list[int]]]:
     """Tracks by number, with the labels that they met, and the rows (from 1) of labels not used, by reason."""
-    # the last frame, with the lens of the calibration
-    used: deque[SonarFrames] = deque(maxlen=1)
-    session = RecognitionSession(
-        log.run,
-        recogniser=recogniser,
-        pictures=False,
-        motion=log.motion,
-        seen=lambda frame, _: used.append(frame),
-    )
+    session = RecognitionSession(log.run, recogniser, log.motion)
+    lens = log.run.calibration.sonar.lens
     tracks: dict[int, LabelledTrack] = defaultdict(LabelledTrack)
     unmet: dict[str, list[int]] = defaultdict(list)
     by_stamp: dict[int, list[tuple[int, Label]]] = defaultdict(list)
     for row, label in enumerate(log.labels.labels, 1):
         by_stamp[label.stamp_ns].append((row, label))
-    for result in session.run(blocks):
+    for frame, result in session.run(blocks):
         stamp_ns = result.stamp_ns
         # its labels cannot meet a track
         if not result.is_used:
@@ -349,7 +343,7 @@ def _labelled_tracks(
         for row, label in by_stamp.pop(stamp_ns, []):
             # the nearest sighting in this frame
             away = {
-                number: _distance(sighting, label) for number, sighting in seen.items()
+                number: _distance(label, sighting) for number, sighting in seen.items()
             }
             nearest = min(away, key=lambda number: away[number], default=None)
             if nearest is not None and away[nearest] <= NEAR_M:
@@ -360,16 +354,10 @@ def _labelled_tracks(
                 in_radians = label.model_copy(
                     update={"azimuth_rad": np.radians(label.azimuth_rad)}
                 )
-                places = {NO_TRACK: label, IN_DEGREES: in_radians} if used else {}
-                reason = next(
-                    (
-                        reason
-                        for reason, at in places.items()
-                        if _is_within(used[0], at)
-                    ),
-                    OUTSIDE,
-                )
-                unmet[reason].append(row)
+                places = {NO_TRACK: label, IN_DEGREES: in_radians}
+                shown = with_lens(frame, lens)
+                fits = [why for why, at in places.items() if _is_within(shown, at)]
+                unmet[fits[0] if fits else OUTSIDE].append(row)
     # labels that are left have no frame with their stamp
     unmet[NO_FRAME] = [row for labels in by_stamp.values() for row, _ in labels]
     unmet[CONTRADICTED] = [
@@ -380,31 +368,22 @@ def _labelled_tracks(
 
 def _is_within(frame: SonarFrames, label: Label) -> bool:
     """True for a place in the image, up to half a bin and half a beam beyond the outer middles."""
-    half_bin, half_beam = (
-        np.abs(np.diff(axis)).max(initial=0) / 2
-        for axis in (frame.ranges_m, frame.azimuths_rad)
-    )
-    return bool(
-        frame.ranges_m.min() - half_bin
-        <= label.range_m
-        <= frame.ranges_m.max() + half_bin
-        and frame.azimuths_rad.min() - half_beam
-        <= label.azimuth_rad
-        <= frame.azimuths_rad.max() + half_beam
-    )
+    axes = (frame.ranges_m, label.range_m), (frame.azimuths_rad, label.azimuth_rad)
+    for middles, place in axes:
+        half = np.abs(np.diff(middles)).max(initial=0) / 2
+        if not middles.min() - half <= place <= middles.max() + half:
+            return False
+    return True
 
 
 def is_of_one_object(one: Label, other: Label) -> bool:
     """True for labels of one frame as near to each other as no two objects are."""
-    across = one.range_m * (one.azimuth_rad - other.azimuth_rad)
-    return one.stamp_ns == other.stamp_ns and bool(
-        np.hypot(one.range_m - other.range_m, across) <= NEAR_M / 2
-    )
+    return one.stamp_ns == other.stamp_ns and _distance(one, other) <= NEAR_M / 2
 
 
-def _distance(sighting: ObjectSighting, label: Label) -> float:
-    across = label.range_m * (sighting.azimuth_rad - label.azimuth_rad)
-    return float(np.hypot(sighting.range_m - label.range_m, across))
+def _distance(label: Label, other: Label | ObjectSighting) -> float:
+    across = label.range_m * (label.azimuth_rad - other.azimuth_rad)
+    return float(np.hypot(label.range_m - other.range_m, across))
 
 
 def place_of(range_m: float, azimuth_rad: float, session: RecognitionSession) -> Floats:

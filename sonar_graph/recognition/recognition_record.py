@@ -98,16 +98,13 @@ class Recognition:
             Of the log, if it has any: landmarks without a design are named.
         """
         named: Counter[int] = Counter()
+        looked_for: set[int] = set()
         if self.detections is not None:
+            looked_for = set(np.unique(self.detections.candidate_ids).tolist())
             ids, probability = self.detections.most_probable()
             # below it "none of them" is the most probable class
             named.update(np.where(probability > LEAST_NAMED, ids, NONE).tolist())
         counts = [f"landmark {i}: {n}" for i, n in sorted(named.items()) if i != NONE]
-        looked_for = (
-            set()
-            if self.detections is None
-            else set(np.unique(self.detections.candidate_ids).tolist())
-        )
         never = ", ".join(map(str, sorted(looked_for - named.keys())))
         shares = [*counts, f"none of them: {named[NONE]}"]
         lines = (

@@ -53,10 +53,7 @@ from sonar_graph.sonar import (
 
 MOST_WARNINGS = 200
 NOT_USED = "frame not used"
-OUT_OF_ORDER = "out of order"
 LEAPT = "out of order: its stamp is ahead of the frame after it"
-NO_ODOMETRY = "no IMU and Doppler log at its stamp"
-
 
 RECOGNISERS = PlugIns(
     "sonar_graph.recognisers",
@@ -203,9 +200,11 @@ def recognise_images(
 
     Without IMU and Doppler log (`ImagesAlone`) the motion is from the images; "fixed" is of a sonar at rest.
     """
+    calibration = sequence.calibration
     session = RecognitionSession(
-        sequence, designs, params, recogniser=recogniser, motion=motion, seen=seen
+        sequence, recogniser or Recogniser(calibration, designs, params), motion
     )
+    drawn = DrawnFrames(calibration.sonar.image)
     if isinstance(images, Path | str):
         images = read_sonar_frames(
             Path(images),
@@ -215,10 +214,17 @@ def recognise_images(
             salvage=salvage,
             refused=session.refuse,
         )
-    for _ in session.run(images):
+    for frame, result in session.run(images):
+        if result.is_used:
+            frame = with_lens(frame, calibration.sonar.lens)
+            drawn.add(frame, result.detections)
+            if seen is not None:
+                seen(frame, result)
         if progress is not None:
             progress(session.frames)
-    return session.finish() if session.frames else None
+    if not session.frames:
+        return None
+    return replace(session.finish(), pictures=drawn.pictures)
 
 
 def with_detections(sequence: Run, recognition: Recognition) -> Run:
@@ -272,39 +278,27 @@ class RecognitionSession:
     def __init__(
         self,
         sequence: Run | ImagesAlone,
-        designs: Sequence[LandmarkDesign] | None = None,
-        params: RecogniserParams | None = None,
-        *,
-        recogniser: LandmarkRecogniser | None = None,
-        pictures: bool = True,
+        recogniser: LandmarkRecogniser,
         motion: MotionFrom = "navigation",
-        seen: Callable[[SonarFrames, RecognisedFrame], None] | None = None,
     ) -> None:
-        self._draws = pictures
-        self._seen = seen
         self.frames = 0
         """Number of frames until now, refused ones included."""
         self._outcomes: Counter[str] = Counter()
         self._warnings: list[tuple[int, str]] = []
-        self._drawn = DrawnFrames(sequence.calibration.sonar.image)
-        self.recogniser = recogniser or Recogniser(
-            sequence.calibration, designs, params
-        )
+        self.recogniser = recogniser
         self.start_T_sonar = gtsam.Pose3()
         """Pose of the sonar at the last frame, in its axes at the first."""
         self.view: FloorView | None = None
         """View of the floor at the last frame, where it is known."""
         self._sonar = sequence.calibration.sonar
-        has_depth = getattr(sequence, "depth", None) is not None
         # for the notes: why the floor was not known, where it was not
-        lacking = (
-            NO_HEIGHT
-            if sequence.calibration.floor is None
-            else ""
-            if has_depth
-            else NO_DEPTH
-        )
-        self._lacks = lacking if motion == "navigation" else NO_TILT
+        self._lacks = ""
+        if motion != "navigation":
+            self._lacks = NO_TILT
+        elif sequence.calibration.floor is None:
+            self._lacks = NO_HEIGHT
+        elif getattr(sequence, "depth", None) is None:
+            self._lacks = NO_DEPTH
         self._motions: SonarMotions | ImageMotions
         if motion == "navigation" and isinstance(sequence, Run):
             self._motions = SonarMotions(sequence)
@@ -316,11 +310,13 @@ class RecognitionSession:
         self._beyond: dict[int, tuple[float, int]] = {}
         """Sum of the evidence `beyond` of each track, and number of its frames."""
 
-    def run(self, blocks: Iterable[SonarFrames]) -> Iterator[RecognisedFrame]:
-        """Recognise blocks of frames; the result of each frame, as it is done."""
+    def run(
+        self, blocks: Iterable[SonarFrames]
+    ) -> Iterator[tuple[SonarFrames, RecognisedFrame]]:
+        """Recognise blocks of frames; each frame with its result, as it is done."""
         frames = (frame for block in blocks for frame in one_by_one(block))
         for frame in without_leaps(frames, self.refuse):
-            yield self.take(frame)
+            yield frame, self.take(frame)
 
     def extend(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
         """Take in rows of the other sensors that have come since, where the images come live."""
@@ -334,8 +330,7 @@ class RecognitionSession:
     def take(self, frame: SonarFrames) -> RecognisedFrame:
         """Recognise a block of one frame."""
         stamp_ns = int(frame.stamps_ns[0])
-        if not self._motions.covers(stamp_ns):
-            reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
+        if reason := self._motions.refusal(stamp_ns):
             self.refuse(stamp_ns, reason)
             return RecognisedFrame.not_used(stamp_ns, f"{NOT_USED}: {reason}")
         self.frames += 1
@@ -367,10 +362,6 @@ class RecognitionSession:
                 beyond = track.sighting.fit.evidence[:, EVIDENCE.index("beyond")]
                 total, count = self._beyond.get(track.id, (0.0, 0))
                 self._beyond[track.id] = total + float(beyond.mean()), count + 1
-        if self._seen is not None:
-            self._seen(frame, result)
-        if self._draws:
-            self._drawn.add(frame, result.detections)
         return result
 
     def refuse(self, stamp_ns: int, reason: str) -> None:
@@ -379,7 +370,7 @@ class RecognitionSession:
         self._warn(stamp_ns, f"{NOT_USED}: {reason}")
 
     def finish(self) -> Recognition:
-        """The whole record."""
+        """The record of all frames, without pictures."""
         notes = {"detections": f"recognised in {self.frames} sonar images"}
         notes |= self.recogniser.notes()
         if isinstance(self._motions, ImageMotions):
@@ -401,7 +392,6 @@ class RecognitionSession:
             else None,
             outcomes=+self._outcomes,  # drops zero counts
             warnings=sorted(self._warnings, key=lambda row: row[0]),
-            pictures=self._drawn.pictures,
             notes=notes,
             unlike=unlike,
         )

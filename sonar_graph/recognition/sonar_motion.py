@@ -18,6 +18,8 @@ KEPT_NS = 60 * NS_PER_S
 """Rows of a live run that are kept before the last frame, for a sensor that is late."""
 KNOWN_HEIGHT_M = 0.1
 """Sigma of a start's height up to which it gives the place of the floor, before the first depth sample."""
+OUT_OF_ORDER = "out of order"
+NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 _NO_BIAS = np.zeros(3)
 
 
@@ -47,11 +49,16 @@ class _Tilt:
             began_at_epoch = self.epoch_ns in self._odometry.epochs(
                 self.epoch_ns - 1, instant_ns
             )
-            measured = (
-                self._gravity(motion, epoch_ns)
-                if self._calibration.use_gravity and began_at_epoch
-                else None
-            )
+            measured = None
+            if self._calibration.use_gravity and began_at_epoch:
+                (before, variance), (after, other) = map(
+                    self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns)
+                )
+                sigma = float(np.sqrt(0.5 * (variance + other)))
+                # direction of up at the epoch, and its standard deviation
+                measured = gravity_direction(
+                    motion, before, after, sigma, self._calibration
+                )
             # predict by the gyros first, then correct by gravity
             self.up, self.variance = self.after(motion)
             if measured is not None:
@@ -71,16 +78,6 @@ class _Tilt:
             motion.i_T_j.rotation().matrix().T @ self.up,
             self.variance + noise + drift**2,
         )
-
-    def _gravity(
-        self, motion: PreintegratedMotion, epoch_ns: int
-    ) -> tuple[Floats, float] | None:
-        """Measured direction of up at an epoch, and its standard deviation."""
-        (before, variance), (after, other) = map(
-            self._odometry.velocity_at_imu, (self.epoch_ns, epoch_ns)
-        )
-        sigma = float(np.sqrt(0.5 * (variance + other)))
-        return gravity_direction(motion, before, after, sigma, self._calibration)
 
 
 class _Height:
@@ -163,13 +160,12 @@ class SonarMotions:
         if settled_ns > self._start_ns + KEPT_NS:
             self._odometry.forget_before(settled_ns - KEPT_NS)
 
-    def covers(self, stamp_ns: int) -> bool:
-        """True for an instant with IMU and Doppler log, not before the last one that was requested."""
-        return self._start_ns <= stamp_ns <= self._end_ns and not self.passed(stamp_ns)
-
-    def passed(self, stamp_ns: int) -> bool:
-        """True for an instant before the last one that was requested."""
-        return not self._is_first and stamp_ns < self._stamp_ns
+    def refusal(self, stamp_ns: int) -> str:
+        """Reason not to use a frame, which is from before the last one or where no sensor is; empty without."""
+        if not self._is_first and stamp_ns < self._stamp_ns:
+            return OUT_OF_ORDER
+        is_covered = self._start_ns <= stamp_ns <= self._end_ns
+        return "" if is_covered else NO_ODOMETRY
 
     def at(self, stamp_ns: int) -> tuple[SonarStep | None, FloorView | None]:
         """Motion since the frame before and view of the floor, at a frame not before that of the last call.

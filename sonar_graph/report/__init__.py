@@ -12,10 +12,11 @@ if TYPE_CHECKING:
     from sonar_graph.report.paper import write_paper
     from sonar_graph.report.rendering import render
     from sonar_graph.report.sentences import doubt_lines, doubtful_lines
+    from sonar_graph.report.track_page import write_track_page
 else:
     __getattr__, __dir__ = at_first_use(__name__)
 
 __all__ = [
     "doubt_lines", "doubtful_lines", "lost_told", "missing_told", "render", "sensors_told", "summary",
-    "withheld_told", "write_batch_report", "write_page", "write_paper", "write_report",
+    "withheld_told", "write_batch_report", "write_page", "write_paper", "write_report", "write_track_page",
 ]

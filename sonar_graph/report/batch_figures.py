@@ -105,4 +105,4 @@ def _finite(batch: RecordedBatch, log: str, metric: Metric) -> Floats:
     """The finite values of all runs on a log, of both estimates."""
     places = product(batch.contestants, metric.keys.values())
     values = np.concatenate([batch.values(log, name, key) for name, key in places])
-    return np.asarray(values[np.isfinite(values)])
+    return values[np.isfinite(values)]

@@ -73,19 +73,12 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
     chapters: list[dict[str, Any]] = []
     for metric in metrics:
         if any(summary.is_asked(batch, log, metric) for log in batch.logs):
-            both = [
-                tables.accuracy_table(batch, metric),
-                tables.difference_table(batch, metric, tests),
-            ]
-            chapters.append(
-                {
-                    "metric": metric,
-                    "drawing": figures.spread_drawing(batch, metric),
-                    "tables": [
-                        summary.marked(batch, table) for table in both if table.rows
-                    ],
-                }
-            )
+            accuracy = tables.accuracy_table(batch, metric)
+            differences = tables.difference_table(batch, metric, tests)
+            both = [one for one in (accuracy, differences) if one.rows]
+            drawing = figures.spread_drawing(batch, metric)
+            marked = [summary.marked(batch, one) for one in both]
+            chapters.append({"metric": metric, "drawing": drawing, "tables": marked})
     # tables leave the page as files, and must state there too what is missing
     overview = None
     if head := summary.head_metric(batch, metrics):
@@ -120,14 +113,7 @@ def batch_content(batch: RecordedBatch) -> dict[str, Any]:
             f"{counted(len(batch.runs), 'run')} of {counted(len(batch.contestants), 'estimator')} on "
             f"{counted(len(batch.logs), 'log')}, up to {counted(seeds, 'seed')} each, compared with {batch.reference}."
         ),
-        "failed": [
-            *summary.missing_told(batch),
-            *summary.absent_told(batch),
-            *summary.failures_told(batch),
-            *summary.sensors_told(batch),
-            *summary.withheld_told(batch),
-        ],
-        "warnings": [*summary.reference_told(batch), *summary.instants_told(batch)],
+        "warnings": summary.warnings_of(batch),
         "overview": overview,
         "folded_rows": FOLDED_ROWS,
         "estimates": [f"{sentence}." for sentence in ESTIMATES.values()],

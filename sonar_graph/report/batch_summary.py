@@ -21,7 +21,6 @@ from sonar_graph.report.batch_tables import (
     GROUP_COLUMNS,
     SIGNIFICANT,
     Tests,
-    shown,
     unit_of,
     without_value,
 )
@@ -34,6 +33,20 @@ NAMED = 3
 LOWER = "\N{DOWNWARDS ARROW}"
 HIGHER = "\N{UPWARDS ARROW}"
 DIFFERENT = "\N{NOT EQUAL TO}"
+
+
+def warnings_of(batch: RecordedBatch) -> list[str]:
+    """All that a reader must see first: what failed or is missing, then what puts numbers in doubt."""
+    tellers = (
+        missing_told,
+        absent_told,
+        failures_told,
+        sensors_told,
+        withheld_told,
+        reference_told,
+        instants_told,
+    )
+    return [sentence for told in tellers for sentence in told(batch)]
 
 
 def failures_told(batch: RecordedBatch) -> list[str]:
@@ -144,7 +157,7 @@ def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
             # medians, because a mean over a group with a lost run does not exist
             told = summarise(batch.values(log, name, key))
             found = tests.get((key, log, name))
-            text = f"{shown(told.median * metric.factor)} {mark_of(found)}".rstrip()
+            text = f"{metric.text(told.median)} {mark_of(found)}".rstrip()
             p_value = found[1] if found else math.nan
             note = without_value(told)
             rows[-1].append(number(told.median, text, p_value, note=note))

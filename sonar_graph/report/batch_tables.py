@@ -56,11 +56,6 @@ def groups_of(batch: RecordedBatch) -> Iterator[tuple[str, str, list[RecordedRun
             yield log, contestant, group
 
 
-def shown(value: float) -> str:
-    """A number with three significant digits, and words for infinity, which stands for runs without a value."""
-    return "no value" if math.isinf(value) else format_value(value)
-
-
 def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
     """Every contestant against the reference in every error; a filter's two estimates, being equal, are one test.
 
@@ -147,7 +142,7 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
         for key in metric.keys.values():
             if batch.is_asked(log, contestant, key):
                 told = summarise(batch.values(log, contestant, key))
-                row += summary_cells(told, metric.factor)
+                row += summary_cells(told, metric)
             else:
                 row += [absent(2), absent(), absent(2)]
         rows.append(row)
@@ -165,17 +160,17 @@ def without_value(told: SampleSummary) -> str:
     return f"{told.without} of {told.runs} without a value" if told.without else ""
 
 
-def summary_cells(told: SampleSummary, factor: float) -> list[Cell]:
+def summary_cells(told: SampleSummary, metric: Metric) -> list[Cell]:
     """Mean with its error, median, and range of the middle 80 %."""
-    text = shown(told.mean * factor)
+    text = metric.text(told.mean)
     if math.isfinite(told.standard_error):
-        text += f" ± {shown(told.standard_error * factor)}"
+        text += f" ± {metric.text(told.standard_error)}"
     mean = number(told.mean, text, told.standard_error, note=without_value(told))
-    median = number(told.median, shown(told.median * factor))
+    median = number(told.median, metric.text(told.median))
     # one run has no spread
     if told.runs == 1:
         return [mean, median, absent(2)]
-    spread = f"{shown(told.low * factor)} to {shown(told.high * factor)}"
+    spread = f"{metric.text(told.low)} to {metric.text(told.high)}"
     return [mean, median, number(told.low, spread, told.high)]
 
 
@@ -201,38 +196,33 @@ def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Tabl
         pairs = Cell(known[0].counted, (known[0].pairs, known[0].each), note)
         row = [*group_cells(batch, log, contestant), pairs]
         for found in own:
-            row += _difference_cells(found, metric.factor)
+            row += _difference_cells(found, metric)
         rows.append(row)
     caption = f"{_unit_note(metric)} Contestant minus {batch.reference}: negative means smaller than the reference."
     return _metric_table("difference", metric, caption, columns, rows)
 
 
 def _difference_cells(
-    found: tuple[PairedDifference, float] | None, factor: float
+    found: tuple[PairedDifference, float] | None, metric: Metric
 ) -> list[Cell]:
     """Mean with its interval, median, count of smaller ones, and p value."""
     if found is None:
         return [absent(3), absent(), absent(), absent(2)]
     test, p_holm = found
     low, high = test.interval
-    note = "" if math.isnan(low) else f"{shown(low * factor)} to {shown(high * factor)}"
-    median = shown(test.median * factor)
+    note = "" if math.isnan(low) else f"{metric.text(low)} to {metric.text(high)}"
+    median = metric.text(test.median)
     # half of the pairs have no value on one side: a word is clearer than an infinite number
     if math.isinf(test.median):
         median = (
             "worse: no value" if test.median > 0 else "better: reference has no value"
         )
     return [
-        number(test.mean, shown(test.mean * factor), low, high, note=note),
+        number(test.mean, metric.text(test.mean), low, high, note=note),
         number(test.median, median),
         Cell(f"{test.smaller} of {test.counted}", (test.smaller,)),
-        number(p_holm, p_text(p_holm), test.p_value),
+        number(p_holm, "< 0.001" if p_holm < 1e-3 else f"{p_holm:.3f}", test.p_value),
     ]
-
-
-def p_text(p_value: float) -> str:
-    """A p value with three decimals, down to one in a thousand."""
-    return "< 0.001" if p_value < 1e-3 else f"{p_value:.3f}"
 
 
 def _metric_table(
@@ -294,7 +284,7 @@ def consistency_table(batch: RecordedBatch) -> Table:
                     words(what),
                     count(found.runs, failed_of(group, "failed: no average")),
                     number(low, f"{low:.2f} to {high:.2f}", high),
-                    number(found.mean, shown(found.mean)),
+                    number(found.mean, format_value(found.mean)),
                     words(found.verdict),
                 ]
             )

@@ -3,19 +3,18 @@
 Layout and explanations: ``templates/comparison.html``. Design: docs/design/0008.
 """
 
-import json
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any
 
 from sonar_graph.errors import ArgumentError, EvaluationError
 from sonar_graph.evaluation import (
     Comparison,
     aligned_to_truth,
     compact_table,
-    format_value,
     repeats_published,
     run_columns,
     score_keys,
@@ -23,16 +22,18 @@ from sonar_graph.evaluation import (
     write_comparison,
     write_viewer_files,
 )
-from sonar_graph.files import COMPARISON, as_path, result_written
+from sonar_graph.files import COMPARISON, as_path, refused, result_written
 from sonar_graph.logs import PICTURES
 from sonar_graph.report import sentences
 from sonar_graph.report.figures import RAW_VIEW, illustrations
 from sonar_graph.report.given_map import given_map_table
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
-from sonar_graph.report.rendering import PageSection, data_address, html_of, write_html
-from sonar_graph.sequence import Sequence
-from sonar_graph.states import Outcome, counted
-from sonar_graph.table import ABSENT, Column, Table, text_table, words
+from sonar_graph.report.rendering import PageSection, html_of, write_html
+from sonar_graph.states import Outcome
+from sonar_graph.table import ABSENT, Column, Table, text_table
+
+if TYPE_CHECKING:
+    from sonar_graph.recognition import Recognition
 
 PAGE = "report.html"
 SECTIONS = (
@@ -105,15 +106,13 @@ def write_report(
             "compare(sequence, names) gives one"
         )
     folder = as_path(folder, "write_report(comparison, folder)")
-    try:
-        with result_written(folder, COMPARISON, overwrite=overwrite):
-            write_comparison(comparison, folder)
-            write_viewer_files(comparison, folder)
-            return write_page(comparison, folder)
-    except OSError as error:
-        raise EvaluationError(
-            f"{folder}: cannot be written: {error.strerror}; choose another folder"
-        ) from error
+    with (
+        refused(folder, EvaluationError, "choose another folder"),
+        result_written(folder, COMPARISON, overwrite=overwrite),
+    ):
+        write_comparison(comparison, folder)
+        write_viewer_files(comparison, folder)
+        return write_page(comparison, folder)
 
 
 def write_page(comparison: Comparison, folder: Path) -> Path:
@@ -144,28 +143,21 @@ def render_report(comparison: Comparison) -> str:
 
 def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
     """The sections of the page, and the values that their macros use."""
-    sequence = comparison.sequence
-    runs = comparison.runs
-    detections = len(sequence.detections) if sequence.detections else 0
     # None without errors: then figures and tables have one view
     aligned = aligned_to_truth(comparison)
+    figures = illustrations(comparison)
+    landmarks = _views(
+        "landmarks", landmark_table(aligned or comparison), landmark_table(comparison)
+    )
     outcomes = outcome_table(comparison)
+    names = [run.estimator for run in comparison.runs]
     content: dict[str, Any] = {
-        "name": sequence.name,
-        "names": [run.estimator for run in runs],
-        "beside_the_paper": sentences.beside_the_paper(comparison),
-        "summary": (
-            f"{', '.join(run.estimator for run in runs)} on {format_value(round(sequence.duration_s, 1))} s of "
-            f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion {_of_truth(sequence)}: "
-            f"{counted(detections, 'landmark detection')}."
-        ),
-        "headlines": {
-            "aligned": sentences.headline(comparison),
-            "raw": sentences.headline(comparison, aligned=False) if aligned else "",
-        },
-        "published": sentences.published_filters(comparison),
-        "remarks": sentences.remarks(comparison),
-        "doubts": sentences.doubts(comparison),
+        "name": comparison.sequence.name,
+        "names": names,
+        "comparison": comparison,
+        "sentences": sentences,
+        "detections": len(comparison.sequence.detections or ()),
+        "aligned": aligned,
         "failed": text_table(
             "failed",
             "Runs that did not come to an end",
@@ -180,37 +172,22 @@ def _page(comparison: Comparison) -> tuple[list[PageSection], dict[str, Any]]:
         ),
         "scores": score_table(comparison),
         "protocols": protocols(comparison),
-        "figures": illustrations(comparison),
-        "landmarks": _views(
-            "landmarks",
-            landmark_table(aligned or comparison),
-            landmark_table(comparison),
-        ),
+        "figures": figures,
+        "landmarks": landmarks,
         "left_out": landmarks_left_out(comparison),
         "given_map": given_map_table(comparison),
-        "has_true_landmarks": sequence.true_landmarks is not None,
-        "nameless": sentences.nameless_landmarks(comparison),
-        "paper": PAPER if repeats_published(sequence) else "",
+        "paper": PAPER if repeats_published(comparison.sequence) else "",
         "outcomes": outcomes,
-        "refused": sentences.refusal_lines(comparison),
-        "recognition": recognition_content(comparison),
-        "files": {
-            run.estimator: {
-                name: f"runs/{quote(run.estimator)}/{name}"
-                for name, field in RUN_FILES.items()
-                if getattr(run, field) is not None
-            }
-            for run in runs
-        },
-        "settings": {run.estimator: _as_json(run.params) for run in runs},
-        "calibration": _as_json(sequence.calibration.model_dump(mode="json")),
-        "notes": sequence.notes,
-        "environment": comparison.environment,
+        "topic": PICTURES,
+        "run_files": RUN_FILES,
     }
+    found = comparison.recognition
+    if found is not None:
+        content |= _recognition_tables(found, comparison.sequence.start_ns)
     is_shown = {
-        "detections": detections > 0 or bool(outcomes.rows),
-        "recognition": content["recognition"] is not None,
-        "landmarks": content["landmarks"] or content["figures"]["growth"].svg,
+        "detections": content["detections"] or outcomes.rows,
+        "recognition": found,
+        "landmarks": landmarks or figures["growth"].svg,
     }
     return [one for one in SECTIONS if is_shown.get(one.anchor, True)], content
 
@@ -232,10 +209,6 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
         outcome_table(comparison),
     )
     return [table for table in tables if table and table.rows]
-
-
-def _as_json(values: Any) -> str:
-    return json.dumps(values, indent=2, default=str, ensure_ascii=False)
 
 
 def protocols(
@@ -277,9 +250,8 @@ def outcome_table(comparison: Comparison) -> Table:
     if rows:
         totals = [str(count.total()) if count else ABSENT for count in counts]
         rows.append(["All detections", *totals])
-    columns = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
-    cells = [[words(text) for text in row] for row in rows]
-    return Table("outcomes", "What became of each detection", "", columns, cells)
+    heads = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
+    return text_table("outcomes", "What became of each detection", heads, rows)
 
 
 def _share(count: Counter[Outcome], outcome: Outcome) -> str:
@@ -290,30 +262,14 @@ def _share(count: Counter[Outcome], outcome: Outcome) -> str:
     return f"{number} ({100 * number / count.total():.1f} %)"
 
 
-def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
-    """Pictures, outcomes and warnings; None where nothing was recognised here."""
-    found = comparison.recognition
-    sequence = comparison.sequence
-    if found is None:
-        return None
+def _recognition_tables(found: Recognition, start_ns: int) -> dict[str, Any]:
+    """The tables of outcomes and warnings, and the probability from which on an identity is sure."""
     # a recogniser takes a while to load, and most logs have detections
     from sonar_graph.recognition import SURE
 
-    start_ns = sequence.start_ns
-    pictures = []
-    for picture in found.shown():
-        pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)
-        named = ", ".join(f"ID {landmark} ({share:.2f})" for landmark, share in pairs)
-        caption = f"T = {(picture.stamp_ns - start_ns) * 1e-9:.1f} s: {named}"
-        address = data_address(picture.jpeg, "image/jpeg")
-        pictures.append({"address": address, "caption": caption})
     return {
-        "frames": found.frames,
-        "detections": 0 if sequence.detections is None else len(sequence.detections),
         "sure": SURE,
-        "topic": PICTURES,
-        "pictures": pictures,
-        "outcomes": text_table(
+        "recognised": text_table(
             "recognition",
             "What became of candidates, tracks and frames",
             ["Outcome", "Count"],
@@ -330,12 +286,3 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
             numbers=False,
         ),
     }
-
-
-def _of_truth(sequence: Sequence) -> str:
-    if sequence.truth is None:
-        return "without ground truth"
-    orientation = (
-        "" if sequence.true_poses else "true positions, but no true orientation"
-    )
-    return f"with {orientation or 'ground truth'}"

@@ -7,14 +7,15 @@ from rich.text import Text
 
 from sonar_graph.evaluation import (
     RAW,
+    SCORES,
     Comparison,
     headline_metric,
     label,
     score_keys,
+    scores_across,
 )
 from sonar_graph.report import sentences
 from sonar_graph.report.given_map import located_line
-from sonar_graph.table import ABSENT
 
 # columns after the two position errors; those that no run has are left out
 COLUMNS = {
@@ -62,15 +63,8 @@ def summary(comparison: Comparison) -> Group:
     The numbers are those of the report. NEES is 1 for a consistent estimator and marked by `Score.verdict`. The lines
     below the table may be as wide as the terminal.
     """
-    errors = error_columns(comparison)
-    # columns that no run has would take the place of names
-    present = score_keys(comparison)
-    mapped = {} if errors else {"landmarks.se2_m": "map"}
-    columns = {
-        key: heading
-        for key, heading in {**errors, **mapped, **COLUMNS}.items()
-        if key in present
-    }
+    headings = error_columns(comparison) or {"landmarks.se2_m": "map"}
+    columns, rows = scores_across(comparison, headings | COLUMNS, before_unit="\n")
     table = Table(
         box=SIMPLE_HEAD,
         show_edge=False,
@@ -78,17 +72,11 @@ def summary(comparison: Comparison) -> Group:
         padding=(0, 1, 0, 0),
     )
     table.add_column("estimator", no_wrap=True)
-    for key, heading in columns.items():
-        one = next(own[key] for own in comparison.scores.values() if key in own)
-        head = f"{heading}\n({one.shown_unit})" if one.shown_unit else heading
-        table.add_column(Text(head), justify="right", no_wrap=True)
-    for name in (run.estimator for run in comparison.runs):
-        cells = []
-        for key in columns:
-            score = comparison.score_of(name, key)
-            shown = score.text() + MARKS.get(score.verdict, "") if score else ABSENT
-            cells.append(Text(shown))
-        table.add_row(Text(name), *cells)
+    for column in columns:
+        table.add_column(Text(column.heading), justify="right", no_wrap=True)
+    for run, cells in zip(comparison.runs, rows, strict=True):
+        shown = (Text(cell.text + MARKS.get(cell.note, "")) for cell in cells)
+        table.add_row(Text(run.estimator), *shown)
     # the title of a table would be folded to the table's width
     title = Text(comparison.sequence.name, style="bold")
     return Group(title, table, Text("\n".join(["", *_lines_below(comparison)])))
@@ -96,19 +84,16 @@ def summary(comparison: Comparison) -> Group:
 
 def _lines_below(comparison: Comparison) -> list[str]:
     """Failures, warnings about the log, warnings of runs that may follow from these, and the meaning of the columns."""
-    lines = sentences.failed_lines(comparison)
-    # first, as the numbers above are not to be relied on
+    environment = comparison.environment
+    sequence = comparison.sequence
     doubtful = sentences.doubtful_lines(comparison)
-    lines += doubtful
-    lines += [
-        line
-        for line in sentences.doubt_lines(comparison.sequence.notes)
-        if line not in doubtful
-    ]
+    noted = sentences.doubt_lines(sequence.notes)
+    # doubtful ones first, as the numbers above are not to be relied on
+    lines = [*sentences.failed_lines(comparison), *doubtful]
+    lines += [line for line in noted if line not in doubtful]
     lines += sentences.lost_runs(comparison)
     if located := located_line(comparison):
-        scored = comparison.environment["scored instants"]
-        lines.append(f"{located} Scored: {scored}")
+        lines.append(f"{located} Scored: {environment['scored instants']}")
     for told in (
         sentences.refusal_lines,
         sentences.withheld_lines,
@@ -119,36 +104,34 @@ def _lines_below(comparison: Comparison) -> list[str]:
         sentences.nameless_landmarks,
     ):
         lines += told(comparison)
-    if comparison.recognition is not None:
-        found = comparison.recognition
-        named = found.naming(comparison.sequence.true_landmarks)
+    if (found := comparison.recognition) is not None:
         warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
-        lines += [f"Sonar images: {line}" for line in [*named, *warned]]
-    elif "detections.model" in comparison.sequence.notes:
+        told_of_images = [*found.naming(sequence.true_landmarks), *warned]
+        lines += [f"Sonar images: {line}" for line in told_of_images]
+    elif "detections.model" in sequence.notes:
         lines.append(RECOGNISED_BEFORE)
-    has_detections = bool(comparison.sequence.detections)
-    if not has_detections:
+    if not sequence.detections:
         lines.append(sentences.no_detections(comparison))
     metric = headline_metric(comparison)
     present = score_keys(comparison)
     if metric is None:
         if "landmarks.se2_m" in present:
-            lines.append(f"map: {label('se2_m', comparison)}")
-        why = comparison.environment["scored instants"].removeprefix("none: ")
+            lines.append(f"map: {label(SCORES['landmarks.se2_m'].label, comparison)}")
+        why = environment["scored instants"].removeprefix("none: ")
         return [*lines, f"No position errors: {why}"]
     if metric != RAW:
-        lines.append(f"aligned: {label(metric, comparison)}")
+        lines.append(f"aligned: {label(SCORES[f'causal.{metric}'].label, comparison)}")
     if f"causal.{RAW}" in present:
-        lines.append(f"raw: {label(RAW, comparison)}")
+        lines.append(f"raw: {label(SCORES[f'causal.{RAW}'].label, comparison)}")
     lines.append(NEES_LEGEND)
-    for name in (run.estimator for run in comparison.runs):
-        score = comparison.score_of(name, "causal.nees_position")
-        is_odometry = name == "dead-reckoning" or not has_detections
-        if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
-            # odometry alone contradicts the reference: no estimator is to blame
-            known = comparison.sequence.notes.get("truth")
-            return [
-                *lines,
-                ASK_INSPECT.format(f" (the log says: {known})" if known else ""),
-            ]
+    # odometry alone that contradicts the reference: no estimator is to blame
+    far = [
+        run.estimator
+        for run in comparison.runs
+        if (score := comparison.score_of(run.estimator, "causal.nees_position"))
+        and score.value > FAR_FROM_FITTING
+    ]
+    if far and (not sequence.detections or "dead-reckoning" in far):
+        known = sequence.notes.get("truth")
+        lines.append(ASK_INSPECT.format(f" (the log says: {known})" if known else ""))
     return lines

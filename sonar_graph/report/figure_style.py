@@ -81,7 +81,7 @@ class Illustration:
     """Letters, digits and hyphens, unique on the page."""
     title: str
     caption: str
-    svg: str
+    svg: str = ""
     """Empty where there is nothing to draw."""
     instead: str = ""
     """Sentence in place of the caption where there is nothing to draw."""

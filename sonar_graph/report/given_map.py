@@ -11,11 +11,10 @@ from sonar_graph.calibration import KnownMap
 from sonar_graph.evaluation import Comparison, RunResult, fixed
 from sonar_graph.models import LOCATED_AGAIN
 from sonar_graph.report import figure_style as style
+from sonar_graph.report.landmark_table import DECIMALS, MOST_LANDMARKS, places_of
 from sonar_graph.states import ABSENT, Outcome
 from sonar_graph.table import Table, text_table
 
-MOST_LANDMARKS = 30
-DECIMALS = 3
 MOVED = "moved"
 
 
@@ -59,16 +58,21 @@ def draw_given_map(panel: Axes, comparison: Comparison) -> None:
     known = comparison.sequence.calibration.map
     if known is None or comparison.is_aligned:
         return
-    places = np.array(known.positions_m)[:, :2]
+    places = dict(zip(known.ids, np.array(known.positions_m)[:, :2], strict=True))
     look: dict[str, Any] = {"markersize": 10, "markerfacecolor": "none", "zorder": 3}
-    panel.plot(*places.T, "s", color=style.MUTED, label="map that was given", **look)
-    row = {landmark_id: k for k, landmark_id in enumerate(known.ids)}
+    panel.plot(
+        *zip(*places.values(), strict=True),
+        "s",
+        color=style.MUTED,
+        label="map that was given",
+        **look,
+    )
     for index, run in enumerate(comparison.runs):
         own = style.colour(index)
+        found = places_of(run.landmarks)
         for landmark_id in mapped_again(run, known):
-            found = place_of(run, landmark_id)
-            if found is not None:
-                ends = np.array([places[row[landmark_id]], found[:2]])
+            if landmark_id in found:
+                ends = np.array([places[landmark_id], found[landmark_id][:2]])
                 panel.plot(*ends.T, color=own, linewidth=2.5, zorder=6)
         is_found = comparison.sequence.calibration.start.source == "map"
         if is_found and run.causal:
@@ -89,26 +93,20 @@ def landmarks_moved(comparison: Comparison) -> bool:
     )
 
 
-def place_of(run: RunResult, landmark_id: int) -> Any:
-    """Estimated place of a landmark at the end, shape (3,), m; None where the run has none."""
-    if run.landmarks is None or landmark_id not in run.landmarks.ids:
-        return None
-    return run.landmarks.positions[run.landmarks.ids == landmark_id][0]
-
-
 def given_map_table(comparison: Comparison) -> Table | None:
     """The map before and after: each landmark as given, and how far each run has it from there; None without a map."""
     known = comparison.sequence.calibration.map
     runs = [run for run in comparison.runs if run.landmarks is not None]
     if known is None or not runs:
         return None
+    mapped = {run.estimator: places_of(run.landmarks) for run in runs}
     sigmas_m = np.sqrt(np.diag(known.joint()).reshape(-1, 3)[:, :2].mean(axis=1))
     rows = []
     for k, landmark_id in enumerate(known.ids):
         given = np.array(known.positions_m[k])
         cells = []
         for run in runs:
-            found = place_of(run, landmark_id)
+            found = mapped[run.estimator].get(landmark_id)
             if landmark_id not in landmarks_with(run, list(Outcome)):
                 cells.append("not seen")
             elif found is None:
@@ -124,12 +122,11 @@ def given_map_table(comparison: Comparison) -> Table | None:
         rows.append([str(landmark_id), place, fixed(sigmas_m[k], DECIMALS), *cells])
     # what moved first, then what was seen
     rows.sort(key=lambda cells: (MOVED not in " ".join(cells), "not seen" in cells))
-    found_ids = {int(i) for run in runs if run.landmarks for i in run.landmarks.ids}
-    added = sorted(found_ids.difference(known.ids))
+    added = sorted(set[int]().union(*mapped.values()).difference(known.ids))
     caption = "The map before and after: places as given, and the horizontal distance of each run's map from them, metres"
     if len(rows) > MOST_LANDMARKS:
         caption += f"; {len(rows) - MOST_LANDMARKS} more landmarks are in map.toml"
     if added:
         caption += f"; new: {', '.join(map(str, added[:MOST_LANDMARKS]))}"
-    heads = ["Landmark", "given x, y", "sigma", *(run.estimator for run in runs)]
+    heads = ["Landmark", "given x, y", "sigma", *mapped]
     return text_table("given_map", caption, heads, rows[:MOST_LANDMARKS])

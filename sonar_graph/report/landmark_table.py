@@ -3,7 +3,7 @@
 Where a run repeats the published experiment, the paper's own table stands beside it.
 """
 
-import numpy as np
+import math
 
 from sonar_graph.evaluation import (
     Comparison,
@@ -15,8 +15,9 @@ from sonar_graph.evaluation import (
     scored_map,
     unaligned,
 )
+from sonar_graph.measurements import Floats
 from sonar_graph.states import LandmarkMap, landmark_name
-from sonar_graph.table import ABSENT, Column, Table, words
+from sonar_graph.table import ABSENT, Column, Table, text_table
 
 PAPER = "2014 paper"
 # largest number of landmarks in rows; others are left to ``landmarks.csv``
@@ -25,11 +26,11 @@ DECIMALS = 3
 PAPER_DECIMALS = 2
 
 
-def coordinate(landmarks: LandmarkMap | None, identity: int, axis: int) -> float | None:
-    """The x or y of a landmark; None where it is not in the map, or without a map."""
-    if landmarks is None or identity not in landmarks.ids:
-        return None
-    return float(landmarks.positions[landmarks.ids == identity, axis][0])
+def places_of(landmarks: LandmarkMap | None) -> dict[int, Floats]:
+    """Positions of landmarks by identity, each of shape (3,), m; empty without a map."""
+    if landmarks is None:
+        return {}
+    return dict(zip(landmarks.ids.tolist(), landmarks.positions, strict=True))
 
 
 def landmark_table(comparison: Comparison) -> Table | None:
@@ -52,41 +53,36 @@ def landmark_table(comparison: Comparison) -> Table | None:
     if repeats_published(comparison.sequence):
         maps[PAPER] = published_maps()[0]
     rows: list[list[str]] = []
+    true_places = places_of(true)
+    places = {name: places_of(landmarks) for name, landmarks in maps.items()}
     for id_ in mapped_ids(comparison, list(maps.values()))[:MOST_LANDMARKS]:
+        at = true_places.get(id_)
         # the paper gives x and y
-        for axis in (0, 1):
-            at = coordinate(true, id_, axis)
-            row = [f"ID {landmark_name(id_)}, {'xy'[axis]}"]
-            row.append(_with_difference(at, None, DECIMALS))
-            for name, landmarks in maps.items():
+        for axis, letter in enumerate("xy"):
+            row = [f"ID {landmark_name(id_)}, {letter}"]
+            # without a truth its column would be empty
+            row += [] if true is None else [_with_difference(at, None, axis, DECIMALS)]
+            for name, known in places.items():
                 decimals = PAPER_DECIMALS if name == PAPER else DECIMALS
-                value = coordinate(landmarks, id_, axis)
-                row.append(_with_difference(value, at, decimals))
+                row.append(_with_difference(known.get(id_), at, axis, decimals))
             rows.append(row)
     sections = {}
+    heads = [Column("quantity", "Quantity", is_number=False)]
+    caption = "Positions in the map at the end, metres"
     if true is not None:
         # below the last landmark
         sections[len(rows)] = "In all"
-        errors = [landmark_errors(landmarks, true) for landmarks in maps.values()]
-        if not is_aligned:
-            raw = [
-                fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors
-            ]
-            rows.append([f"RMS, {unaligned(comparison.sequence)}", "", *raw])
-        aligned = [
-            ABSENT if np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS)
-            for e in errors
-        ]
-        rows.append(["RMS after SE(2) alignment", "", *aligned])
-    heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
-    heads += [Column(name, name) for name in maps]
-    # without a truth its column would be empty
-    if true is None:
-        heads = [heads[0], *heads[2:]]
-        rows = [[row[0], *row[2:]] for row in rows]
-    caption = "Positions in the map at the end, metres"
-    if true is not None:
+        heads.append(Column("true", "true"))
         caption += "; in brackets estimate minus truth"
+        errors = [landmark_errors(landmarks, true) for landmarks in maps.values()]
+        raw_m = [rmse(e.horizontal_m) if e else math.nan for e in errors]
+        aligned_m = [e.aligned_rmse_m for e in errors]
+        if not is_aligned:
+            what = f"RMS, {unaligned(comparison.sequence)}"
+            rows.append([what, "", *(fixed(value, DECIMALS) for value in raw_m)])
+        what = "RMS after SE(2) alignment"
+        rows.append([what, "", *(fixed(value, DECIMALS) for value in aligned_m)])
+    heads += [Column(name, name) for name in maps]
     if comparison.is_aligned:
         caption += "; each map aligned to the true landmarks"
     elif is_aligned:
@@ -95,8 +91,7 @@ def landmark_table(comparison: Comparison) -> Table | None:
         )
     elif true is not None:
         caption += f"; {unaligned(comparison.sequence)}"
-    cells = [[words(text) for text in row] for row in rows]
-    return Table("landmarks", caption, "", heads, cells, sections)
+    return text_table("landmarks", caption, heads, rows, sections=sections)
 
 
 def mapped_ids(comparison: Comparison, maps: list[LandmarkMap]) -> list[int]:
@@ -112,9 +107,13 @@ def landmarks_left_out(comparison: Comparison) -> int:
     return max(0, len(mapped_ids(comparison, maps)) - MOST_LANDMARKS) if maps else 0
 
 
-def _with_difference(value: float | None, true: float | None, decimals: int) -> str:
+def _with_difference(
+    place: Floats | None, true: Floats | None, axis: int, decimals: int
+) -> str:
     """A coordinate in metres, and in brackets its difference to the true one."""
-    if value is None:
+    if place is None:
         return ABSENT
-    shown = fixed(value, decimals)
-    return shown if true is None else f"{shown} ({fixed(value - true, decimals)})"
+    shown = fixed(place[axis], decimals)
+    if true is None:
+        return shown
+    return f"{shown} ({fixed(place[axis] - true[axis], decimals)})"

@@ -6,6 +6,7 @@ Everything that comes from a suite, a log or an estimator is escaped.
 import base64
 import csv
 import io
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
+from sonar_graph.evaluation import format_value
 from sonar_graph.files import replacing, spelt
+from sonar_graph.states import counted
 from sonar_graph.table import Table, as_html
 
 FOLDER = "tables"
@@ -29,7 +32,8 @@ def render(template: str, content: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"svg": Markup, "address": data_address}
+    environment.globals |= {"counted": counted, "format_value": format_value}
+    environment.filters |= {"svg": Markup, "address": data_address, "json": _as_json}
     environment.filters["html"] = lambda table, is_sortable: Markup(
         as_html(table, is_sortable=is_sortable)
     )
@@ -76,6 +80,10 @@ def html_of(kind: str, sections: list[PageSection], content: dict[str, Any]) -> 
 def data_address(content: bytes, kind: str) -> str:
     """Content as an address within the page itself: ``data:KIND;base64,...``."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _as_json(values: Any) -> str:
+    return json.dumps(values, indent=2, default=str, ensure_ascii=False)
 
 
 def write_tables(tables: list[Table], folder: Path) -> None:

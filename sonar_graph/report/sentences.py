@@ -173,7 +173,7 @@ def headline(comparison: Comparison, *, aligned: bool = True) -> str:
         if score.value > 0 and 1 - least.value / score.value < TOO_CLOSE
     ]
     equals = f", {' and '.join(close)} equally near" if close else ""
-    what = label(metric, comparison, HEADLINES)
+    what = label(HEADLINES[metric], comparison)
     # one estimator is not nearest to anything
     leads = f"is nearest to the truth{equals}:" if others else "is"
     opening = f"{name} {leads} {least.with_unit} off{'' if others else ' the truth'} ({what}, causal)"
@@ -225,7 +225,7 @@ def published_filters(comparison: Comparison) -> str:
     if not names:
         return ""
     where = f"; add it with --estimators {','.join([*names, FAIR])}"
-    if any(run.estimator == FAIR for run in comparison.runs):
+    if FAIR in [run.estimator for run in comparison.runs]:
         where = ""
     return (
         f"{' and '.join(names)}: as published, without gate, robust kernel or gyro bias. "
@@ -250,11 +250,10 @@ def _without_errors(comparison: Comparison) -> str:
 def no_detections(comparison: Comparison) -> str:
     """The sentence about the drift of a log, or of the chosen part of it, without detections."""
     part = comparison.sequence.notes.get("log.part")
-    aids = {
-        "headings": comparison.sequence.heading,
-        "position fixes": comparison.sequence.positions,
-    }
-    if there := " and ".join(name for name, block in aids.items() if block is not None):
+    has_heading = comparison.sequence.heading is not None
+    has_fixes = comparison.sequence.positions is not None
+    aids = ["headings"] * has_heading + ["position fixes"] * has_fixes
+    if there := " and ".join(aids):
         return f"The log has no landmark detections; only its {there} limit the drift."
     if not part:
         return NO_DETECTIONS
@@ -399,8 +398,8 @@ def shared_error(comparison: Comparison) -> list[str]:
     """A warning where runs that used landmarks agree with each other, and not with the truth that they are aligned to."""
     used = {}
     for run in comparison.runs:
-        error = comparison.scores[run.estimator].get("causal.ate_se2_m")
-        errors = comparison.errors.get(run.estimator, {}).get("causal")
+        error = comparison.score_of(run.estimator, "causal.ate_se2_m")
+        errors = comparison.errors_of(run)
         if error and errors and Outcome.USED in outcomes_of(run):
             used[run.estimator] = (error.value, errors)
     if len(used) < 2:
@@ -518,11 +517,8 @@ def _listed(ids: list[int]) -> str:
 
 def doubt_lines(notes: Mapping[str, str]) -> list[str]:
     """A line for each of `SAID_NOTES` that a log has: damage, rows left out, gaps, unlikely numbers."""
-    return [
-        f"{word}: {notes[subject]}"
-        for subject, word in SAID_NOTES.items()
-        if subject in notes
-    ]
+    found = SAID_NOTES.items()
+    return [f"{word}: {notes[name]}" for name, word in found if name in notes]
 
 
 def doubtful_lines(comparison: Comparison) -> list[str]:

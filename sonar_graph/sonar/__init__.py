@@ -4,7 +4,7 @@
 from sonar_graph.sonar.appearance import SLANT_PLANE, ObjectSighting
 from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.confusion import (
-    SHIPPED, Confusion, confusion_for, mark_of, posterior_mean_rows, read_confusion, soft_scores,
+    SHIPPED, Accuracy, Confusion, confusion_for, mark_of, read_confusion, soft_scores,
 )
 from sonar_graph.sonar.evidence import EVIDENCE
 from sonar_graph.sonar.geometry import Fan, FloorView, MadeOfWindow, with_lens
@@ -15,8 +15,8 @@ from sonar_graph.sonar.recogniser import (
 from sonar_graph.sonar.tracker import SonarStep
 
 __all__ = [
-    "Confusion", "EVIDENCE", "Fan", "Fate", "FloorView", "FrameCheck", "IdentityParams", "MadeOfWindow",
+    "Accuracy", "Confusion", "EVIDENCE", "Fan", "Fate", "FloorView", "FrameCheck", "IdentityParams", "MadeOfWindow",
     "ObjectSighting", "REPORTED", "RecognisedFrame", "Recogniser", "RecogniserParams", "SHIPPED", "SLANT_PLANE",
-    "SonarStep", "TrackInFrame", "check_block", "confusion_for", "mark_of", "posterior_mean_rows", "read_confusion",
+    "SonarStep", "TrackInFrame", "check_block", "confusion_for", "mark_of", "read_confusion",
     "soft_scores", "with_lens",
 ]

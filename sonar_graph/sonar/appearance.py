@@ -9,7 +9,7 @@ there, against anything else, is in `sonar_graph.sonar.evidence`. Derivation: do
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,14 @@ from sonar_graph.numerics import compiled
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.evidence import Figures
 from sonar_graph.sonar.geometry import FloorView, MadeOfWindow
-from sonar_graph.sonar.place import LONGEST_SHADOW, SHADE_FINE, Grid, Lit, Relief
+from sonar_graph.sonar.place import (
+    LONGEST_SHADOW,
+    SHADE_FINE,
+    Grid,
+    Lit,
+    Relief,
+    fit_place,
+)
 from sonar_graph.sonar.regions import Candidates
 from sonar_graph.sonar.templates import (
     ASSUMED_SLOPE,
@@ -208,7 +215,7 @@ class Appearance:
         # two lengths of the shadow are drawn; in between they are interpolated
         lit = Lit(relief_m * grazing_slope, shade - int(shade))
         start = (fit.centre_m[design] - to_middle_m - patch.centre_m) / cell_m + origin
-        place, bound = relief.place(patch, self._compared, start, lit)
+        place, bound = fit_place(relief, patch, self._compared, start, lit)
         moved_m = np.zeros(2)
         # part of the figure seems covered: place the rest, and count the difference as an error
         if edge >= 0:
@@ -216,7 +223,7 @@ class Appearance:
             x_m, y_m = (cell_m * (one - half) for one in self._compared)
             is_kept = self.figures.is_kept(row, edge, x_m, y_m)
             kept = (self._compared[0][is_kept], self._compared[1][is_kept])
-            of_kept, bound_of_kept = relief.place(patch, kept, place, lit)
+            of_kept, bound_of_kept = fit_place(relief, patch, kept, place, lit)
             # too few cells of the rest are in view: keep the place of the whole
             if np.isfinite(bound_of_kept).all():
                 moved_m = cell_m * (of_kept - place)
@@ -509,8 +516,9 @@ class CandidateFit:
         self._designs = tuple(designs)
         self._params = params
         self._confusion = confusion
-        self._weights = np.array(confusion.weights)
-        self._aperture_rad = elevation_aperture_rad
+        self._grid = partial(
+            PolarGrid.of, elevation_aperture_rad=elevation_aperture_rad
+        )
         self._grids = MadeOfWindow(self._grid)
 
     def at(
@@ -539,9 +547,6 @@ class CandidateFit:
         of_seen = iter(self._sightings(view, range_m, azimuth_rad, bearing_rad, fits))
         return [None if row < 0 else next(of_seen) for row in rows.tolist()]
 
-    def _grid(self, ranges_m: Floats, azimuths_rad: Floats) -> PolarGrid:
-        return PolarGrid.of(ranges_m, azimuths_rad, self._aperture_rad)
-
     def _fit(
         self,
         grid: PolarGrid,
@@ -567,7 +572,7 @@ class CandidateFit:
         if fit is None:
             return None
         # only the likeliest design is placed to a fraction of a cell
-        best = int((fit.evidence @ self._weights).argmax())
+        best = int(self._confusion.log_odds(fit.evidence).argmax())
         slope = ASSUMED_SLOPE if plane is SLANT_PLANE else plane.height_m / away_m
         return Fitted(fit, appearance.place(patch, fit, best, slope))
 
@@ -651,14 +656,8 @@ class CandidateFit:
         Of a track that ends looking like this; rows of NaN where nothing was compared.
         """
         odds = np.full((len(sightings), len(self._designs) + 1), np.nan)
-        fits = {
-            row: one.fit
-            for row, one in enumerate(sightings)
-            if one is not None and one.fit is not None
-        }
-        if fits:
-            odds[[*fits], :-1] = self._confusion.log_odds(
-                np.array([fit.evidence for fit in fits.values()])
-            )
-            odds[[*fits], -1] = 0.0
+        for row, one in enumerate(sightings):
+            if one is not None and one.fit is not None:
+                odds[row, :-1] = self._confusion.log_odds(one.fit.evidence)
+                odds[row, -1] = 0.0
         return odds

@@ -19,7 +19,7 @@ from scipy.special import digamma, gammainccinv, polygamma
 
 from sonar_graph.calibration import Section
 from sonar_graph.devices import LEAST_BRIGHT_DB, LandmarkDesign
-from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
 from sonar_graph.sonar.geometry import FloorView
@@ -69,21 +69,11 @@ def select_candidates(
 ) -> Candidates:
     """Regions of one polar frame over the threshold, rejected ones included.
 
-    Levels in dB, shape (beams, bins), must be finite. Ranges are those of the middles of the bins, azimuths those of
-    the beams. Without a floor (view of None) areas are in the slant plane.
-
-    Raises `MeasurementError` when the shapes do not belong together, or a level is not finite.
+    Levels in dB, shape (beams, bins), are finite: `FrameCheck` refuses other frames. Ranges are those of the middles of
+    the bins, azimuths those of the beams. Without a floor (view of None) areas are in the slant plane.
     """
     params = params or DetectionParams()
     shape = (len(azimuths_rad), len(ranges_m))
-    if image_db.shape != shape or min(shape) < 2:
-        raise MeasurementError(
-            f"sonar frame: shape {image_db.shape}; beams and bins are {shape}, 2 or more"
-        )
-    if not np.isfinite(cv2.sumElems(image_db)[0]):
-        raise MeasurementError(
-            "sonar frame: levels that are not finite; leave the frame out"
-        )
     # width of a beam at mid-range, and length of a bin
     across = abs(float(azimuths_rad[-1] - azimuths_rad[0])) / (len(azimuths_rad) - 1)
     along = abs(float(ranges_m[-1] - ranges_m[0])) / (len(ranges_m) - 1)

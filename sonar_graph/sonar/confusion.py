@@ -7,8 +7,8 @@ Classes and features are the designs in their order, last "none". With phi_k the
 
 The log odds of a track are the mean of l over its looks, times ``W / (W + looks)`` with W the number of independent
 looks: they are bounded, because what was not foreseen of a landmark repeats from look to look. ``matrix[k, j] =
-p(z = j | x = k)`` is the posterior mean of the score of feature j given class k (`posterior_mean_rows`), a score being
-the posterior of one look.
+p(z = j | x = k)`` is the posterior mean of the score of feature j given class k, a score being the posterior of one
+look.
 
 The model that ships, ``default_confusion.json``, was measured on simulated basins with the designs that ship.
 `sonar_graph.recognition.confusion_fit` measures others.
@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
@@ -27,14 +28,12 @@ from sonar_graph.calibration import Section
 from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
 from sonar_graph.files import text_of
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Floats
 from sonar_graph.settings import faults_in
 from sonar_graph.sonar.evidence import EVIDENCE
 
 SHIPPED = Path(__file__).with_name("default_confusion.json")
 """The model of the designs that ship."""
-JEFFREYS = 0.5
-"""Prior count of each feature."""
 ASSUMED_RIGHT = 0.9
 """Share of frames in which an unmeasured landmark is assumed to show its own feature."""
 
@@ -55,6 +54,24 @@ class DesignMark(Section):
     name: str
     digest: str
     """Of `LandmarkDesign.digest`."""
+
+
+class Accuracy(NamedTuple):
+    """Standard deviations along the ray and across it, as they grow with the bounds of a fit.
+
+    ``sigma = usual sigma (bound / usual bound)^power``: a fit with less contrast, with less of the landmark in view or
+    with a larger residual has a larger bound, and errs more than by white noise.
+    """
+
+    usual_m: Floats
+    """Usual bounds, shape (2,)."""
+    usual_sigmas_m: Floats
+    """Standard deviations at these, shape (2,)."""
+    power: float
+
+    def sigmas_m(self, bound_m: Floats) -> Floats:
+        """Standard deviations at bounds, shape (..., 2)."""
+        return self.usual_sigmas_m * (bound_m / self.usual_m) ** self.power
 
 
 class Confusion(Section):
@@ -168,18 +185,22 @@ class Confusion(Section):
         """Log odds of each design against none of them, shape (..., designs), from evidence (..., designs, 11)."""
         return evidence @ np.array(self.weights)
 
+    @property
+    def accuracy(self) -> Accuracy:
+        """Standard deviations of the place that a fit gives."""
+        return Accuracy(
+            np.array([self.range_bound_m, self.across_bound_m]),
+            np.array([self.range_sigma_m, self.across_sigma_m]),
+            self.bound_power,
+        )
+
     def range_azimuth_cov(self, bound_m: Floats, range_m: Floats) -> Floats:
         """Covariances of range and azimuth, shape (n, 2, 2), for `ObjectSighting.bound_m` (n, 2) at ranges (n,).
 
-        ``sigma = usual sigma (bound / usual bound)^power``: a fit with less contrast, with less of the landmark in view
-        or with a larger residual has a larger bound, and errs more than by white noise. What a template lacks is some
-        millimetres of the landmark wherever it lies, so that the law is in metres across, not in angles.
+        What a template lacks is some millimetres of the landmark wherever it lies, so that the law (`Accuracy`) is in
+        metres across, not in angles.
         """
-        usual = np.array([self.range_bound_m, self.across_bound_m])
-        sigmas = (
-            np.array([self.range_sigma_m, self.across_sigma_m])
-            * (bound_m / usual) ** self.bound_power
-        )
+        sigmas = self.accuracy.sigmas_m(bound_m)
         sigmas[:, 1] /= range_m
         covariances = np.zeros((len(bound_m), 2, 2))
         covariances[:, [0, 1], [0, 1]] = sigmas**2
@@ -188,16 +209,6 @@ class Confusion(Section):
 
 def _listed(ids: Sequence[int]) -> str:
     return ", ".join(map(str, ids))
-
-
-def posterior_mean_rows(mean_scores: Floats, trials: Ints) -> Floats:
-    """Posterior mean of each row of a confusion matrix, shape (classes, features), under Jeffreys' Dirichlet prior.
-
-    ``C[k, j] = (n_k m_kj + 1/2) / (n_k + features / 2)`` with the mean scores m of n_k independent trials of class k: a
-    confusion that never happened in n trials keeps about 1 / 2n.
-    """
-    n = trials[:, None]
-    return (n * mean_scores + JEFFREYS) / (n + JEFFREYS * mean_scores.shape[1])
 
 
 def mark_of(design: LandmarkDesign) -> DesignMark:
@@ -221,7 +232,8 @@ def read_confusion(path: Path) -> Confusion:
     """
     try:
         values = json.loads(text_of(path))
-        if isinstance(values, dict) and values.keys() & {
+        names = set(values) if isinstance(values, dict) else set()
+        if names & {
             "sharpness",
             "error_correlation",
             "azimuth_sigma_rad",
@@ -230,7 +242,7 @@ def read_confusion(path: Path) -> Confusion:
                 f"{path}: across_bound_m: missing; it is a model of an earlier version without the bounds of the fit's "
                 "accuracy across; measure it again with sonar-graph calibrate"
             )
-        if isinstance(values, dict) and values.keys() == {"log", "labels"}:
+        if names == {"log", "labels"}:
             raise CalibrationError(
                 f"{path}: is a file of labels; `sonar-graph calibrate LOG --labels {path} -o model.json` makes a model "
                 "of them"

@@ -141,6 +141,8 @@ class FigureOfTemplate(NamedTuple):
     uncovered: Bytes
     has_dark: bool
     radius_m: float
+    gram: Floats
+    kept: Floats
 
 
 class Figures(NamedTuple):
@@ -193,16 +195,9 @@ class Figures(NamedTuple):
             _figure(designs[index], float(heading_rad), grid, blur_m, patch_side)
             for index, heading_rad in pairs
         ]
-        cells, values, smooth, zones, uncovered, has_dark, radius_m = zip(
+        cells, values, smooth, zones, uncovered, has_dark, radius_m, gram, kept = zip(
             *figures, strict=True
         )
-        gram = []
-        kept = []
-        for own, own_uncovered in zip(values, uncovered, strict=True):
-            # over all cells: a patch that is seen whole needs no sum over cells again
-            in_steps = own.astype(float)
-            gram.append(float(STEP) ** 2 * (in_steps.T @ in_steps))
-            kept.append(kept_sums(own, np.ones(len(own), np.float32), own_uncovered))
         # a cell narrower than the width of the blur at half power repeats its neighbour
         independent = math.prod(
             min(templates.cell_m / (HALF_POWER * blur), 1.0) for blur in blur_m
@@ -309,14 +304,20 @@ def _figure(
     uncovered = beyond_m[:, :, None] <= radius_m * np.array(OFFSETS)
     row, column = np.nonzero(is_compared)
     zones = _zones(figure, dark, is_compared)
+    values = np.ascontiguousarray(steps.astype(np.uint8))
+    is_uncovered = uncovered.reshape(len(row), -1).astype(np.uint8)
+    # over all cells: a patch that is seen whole needs no sum over cells again
+    in_steps = values.astype(float)
     return FigureOfTemplate(
         cells=(row * patch_side + column).astype(np.int32),
-        values=np.ascontiguousarray(steps.astype(np.uint8)),
+        values=values,
         smooth=np.ascontiguousarray(smooth[:, is_compared].T.astype(np.float32)),
         zones=zones[is_compared].astype(np.uint8),
-        uncovered=uncovered.reshape(len(row), -1).astype(np.uint8),
+        uncovered=is_uncovered,
         has_dark=has_dark,
         radius_m=radius_m,
+        gram=float(STEP) ** 2 * (in_steps.T @ in_steps),
+        kept=kept_sums(values, np.ones(len(row), np.float32), is_uncovered),
     )
 
 

@@ -92,24 +92,25 @@ class FloorView:
         cos = math.cos(bearing_rad)
         sin = math.sin(bearing_rad)
         ahead_R_level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return FloorView(
-            ahead_R_level @ self.level_R_sonar,
-            self.height_m,
-            self.height_sigma_m,
-            self.tilt_sigma_rad,
-        )
+        return replace(self, level_R_sonar=ahead_R_level @ self.level_R_sonar)
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
-        """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
-        cos_e, sin_e = floor_lift(
-            ranges_m,
-            np.cos(azimuths_rad),
-            np.sin(azimuths_rad),
-            self.level_R_sonar[2],
-            self.height_m,
-        )
-        elevations = np.arctan2(sin_e, cos_e)
-        return points(ranges_m, azimuths_rad, elevations)
+        """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not.
+
+        With ``A = u1 cos a + u2 sin a``, ``B = u3``, ``k = -h / r``, ``w = sqrt(A^2 + B^2 - k^2)``, the solutions are
+        ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to
+        the centre beam.
+        """
+        up = self.level_R_sonar[2]
+        lift = up[2]
+        across = up[0] * np.cos(azimuths_rad) + up[1] * np.sin(azimuths_rad)
+        norm2 = across * across + lift * lift
+        with np.errstate(divide="ignore", invalid="ignore"):
+            k = -self.height_m / ranges_m
+            w = math.copysign(1.0, lift) * np.sqrt(norm2 - k * k)
+        cos_e = (across * k + lift * w) / norm2
+        sin_e = (lift * k - across * w) / norm2
+        return points(ranges_m, azimuths_rad, np.arctan2(sin_e, cos_e))
 
     def floor_point(self, range_m: float, azimuth_rad: float) -> Floats | None:
         """Level (x, y) of the floor point at a range and azimuth, shape (2,); None where the ray does not reach it."""
@@ -271,16 +272,12 @@ def lens_azimuths(lens: str, beams: int, is_rightmost_first: bool = True) -> Flo
     return table
 
 
-def points(
-    ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats | float = 0.0
-) -> Floats:
+def points(ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats) -> Floats:
     """Points in the sonar frame, shape (n, 3)."""
     level = ranges_m * np.cos(elevations_rad)
-    z = ranges_m * np.sin(elevations_rad)
-    return np.stack(
-        [level * np.cos(azimuths_rad), level * np.sin(azimuths_rad), z + 0.0 * level],
-        axis=-1,
-    )
+    x = level * np.cos(azimuths_rad)
+    y = level * np.sin(azimuths_rad)
+    return np.stack([x, y, ranges_m * np.sin(elevations_rad)], axis=-1)
 
 
 def ranges_azimuths_elevations(points_m: Floats) -> tuple[Floats, Floats, Floats]:
@@ -313,21 +310,3 @@ def _elevation_derivatives(points_m: Floats) -> Floats:
     level = np.maximum(np.hypot(points_m[:, 0], points_m[:, 1]), 1e-12)
     lift = points_m[:, 2] / level
     return np.stack([-lift * points_m[:, 0], -lift * points_m[:, 1], level], axis=1)
-
-
-def floor_lift(
-    ranges_m: Floats, cos_a: Floats, sin_a: Floats, up: Floats, height_m: float
-) -> tuple[Floats, Floats]:
-    """Cosine and sine of the elevation at which rays meet the floor, shape (n,); NaN where they do not.
-
-    With ``A = u1 cos a + u2 sin a``, ``B = u3``, ``k = -h / r``, ``w = sqrt(A^2 + B^2 - k^2)``, the solutions are
-    ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to the
-    centre beam.
-    """
-    across = up[0] * cos_a + up[1] * sin_a
-    lift = up[2]
-    norm2 = across * across + lift * lift
-    with np.errstate(divide="ignore", invalid="ignore"):
-        k = -height_m / ranges_m
-        w = math.copysign(1.0, lift) * np.sqrt(norm2 - k * k)
-    return (across * k + lift * w) / norm2, (lift * k - across * w) / norm2

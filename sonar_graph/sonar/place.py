@@ -109,37 +109,23 @@ class Relief(NamedTuple):
             longer=seen_share(is_shaded & ~is_bright, grid.cell_m, grid.blur_m),
         )
 
-    def place(
-        self, patch: Patch, cells: tuple[Ints, Ints], start: Floats, lit: Lit
-    ) -> tuple[Floats, Floats]:
-        """Place of the first cell of the figure's square in a patch, and the bound of its standard deviation, in cells.
-
-        Parameters
-        ----------
-        patch
-            The image around the landmark.
-        cells
-            Rows and columns of the square that are compared.
-        start
-            Place at which to begin, shape (2,).
-        lit
-            What the height adds.
-        """
-        place = start.astype(float)
-        bound = np.full(2, np.inf)
-        fit_place(self, patch, cells, lit, place, bound)
-        return place, bound
-
 
 @compiled
 def fit_place(
-    relief: Relief, patch: Patch, cells: tuple[Ints, Ints], lit: Lit, place: Floats, bound: Floats
-) -> None:  # fmt: skip
-    """Move a place to the least squares, and fill in the Cramer-Rao bound of its standard deviations, in cells.
+    relief: Relief,
+    patch: Patch,
+    cells: tuple[Ints, Ints],
+    start: Floats,
+    lit: Lit,
+) -> tuple[Floats, Floats]:
+    """Place of the first cell of the figure's square in a patch, and the Cramer-Rao bound of its sigmas, in cells.
 
-    ``M = [1, B, D, S, dz/dx, dz/dy]`` with ``dz/dp = -(beta grad B + delta grad D + gamma grad S)``; the bound is the
-    root of the last two on the diagonal of ``s^2 (M^T M)^-1``, s^2 the mean square of what is left.
+    By least squares over the cells of the square (rows, columns), from a place (2,) on. ``M = [1, B, D, S, dz/dx,
+    dz/dy]`` with ``dz/dp = -(beta grad B + delta grad D + gamma grad S)``; the bound is the root of the last two on the
+    diagonal of ``s^2 (M^T M)^-1``, s^2 the mean square of what is left.
     """
+    place = start.copy()
+    bound = np.full(2, np.inf)
     # the near side and the shadow as the sonar lights them from here
     S = relief.shorter + np.float32(lit.longer) * (relief.longer - relief.shorter)
     B = relief.figure + np.float32(lit.side_m) * relief.side
@@ -184,7 +170,7 @@ def fit_place(
         products = np.dot(M, M.T).astype(np.float64)
         count = products[0, 0]
         if count < LEAST_CELLS:
-            return
+            break
         c, inverse = solved(products, size)
         # with no contrast the slopes vanish, and the place is free
         beta = np.float32(max(c[1], LEAST_BETA_DB))
@@ -199,6 +185,7 @@ def fit_place(
             place[1] = y0 + min(max(c[5], -1.0), 1.0)
             bound[0] = math.sqrt(variance * inverse[0])
             bound[1] = math.sqrt(variance * inverse[1])
+    return place, bound
 
 
 @compiled

@@ -322,12 +322,6 @@ class Recogniser:
             for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
             if verdict != CandidateVerdict.ACCEPTED
         ]
-        # a track that ended is never reported again
-        self._reported = {
-            track: self._reported[track]
-            for track in association.ids.tolist()
-            if track in self._reported
-        }
         reported: dict[int, ObjectSighting] = {}
         for row, sighting in enumerate(sightings):
             if sighting is None:
@@ -340,12 +334,13 @@ class Recogniser:
             fates.append(
                 Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome)
             )
-        fates += [
-            Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")
-            for track, reason in zip(
-                association.ended_ids.tolist(), association.ended_reasons, strict=True
+        ended = association.ended_ids.tolist()
+        for track, reason in zip(ended, association.ended_reasons, strict=True):
+            fates.append(
+                Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")
             )
-        ]
+            # it is never reported again
+            self._reported.pop(track, None)
         if not reported:
             return None, fates
         rows = list(reported)

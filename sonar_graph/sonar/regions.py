@@ -191,8 +191,8 @@ def floor_cell(
 ) -> tuple[float, float, float]:
     """Level x and y of the floor point at a range and azimuth, and area per unit of both there; 0 off the floor.
 
-    R is ``level_R_sonar``. The elevation is that of `floor_lift`. Steps in range and in azimuth, at constant height
-    below the sonar, are perpendicular: ``dg = (r / sqrt(r^2 - h^2)) dr`` and ``|dq/da + dq/de de/da| da`` with
+    R is ``level_R_sonar``. The elevation is that of `FloorView.floor_points`. Steps in range and in azimuth, at constant
+    height below the sonar, are perpendicular: ``dg = (r / sqrt(r^2 - h^2)) dr`` and ``|dq/da + dq/de de/da| da`` with
     ``de/da = -(u . dq/da) / (u . dq/de)``.
     """
     (xx, xy, xz), (yx, yy, yz), (up_x, up_y, up_z) = R

@@ -87,9 +87,7 @@ class Templates:
         # a plate of 13 mm throws a shadow of 2 cm, which would pull the best fit away from the sonar
         is_behind = (away_m > material_m) & (x_m > 0.5 * away_m)
         cells = np.flatnonzero((away_m <= material_m + margin_m) & ~is_behind)
-        pictures: list[Floats32] = []
-        of: list[int] = []
-        headings: list[float] = []
+        rows: list[tuple[Floats32, int, float]] = []
         for index, design in enumerate(designs):
             # symmetric designs repeat: of equal pictures the first heading stands for all
             for heading in 2 * np.pi * np.arange(HEADINGS) / HEADINGS:
@@ -97,13 +95,12 @@ class Templates:
                 picture = (bright + SEARCHED_DARK * dark).ravel()[cells]
                 same = (
                     np.mean((picture - known) ** 2) < SAME_SHARE * known.var()
-                    for known, i in zip(pictures, of, strict=True)
+                    for known, i, _ in rows
                     if i == index
                 )
                 if not any(same):
-                    pictures.append(picture)
-                    of.append(index)
-                    headings.append(heading)
+                    rows.append((picture, index, heading))
+        pictures, of, headings = zip(*rows, strict=True)
         return cls(
             cell_m,
             side,
@@ -286,9 +283,7 @@ class Patch(NamedTuple):
     @classmethod
     def of(cls, level_db: Floats32, seen: Floats32, centre_m: Floats) -> Patch:
         """Patch with these levels."""
-        held, smooth = np.empty((2, *seen.shape), np.float32)
-        smooth_levels(level_db, seen, smooth, held)
-        return cls(level_db, seen, smooth, held, centre_m)
+        return cls(level_db, seen, *smooth_levels(level_db, seen), centre_m)
 
 
 WIDTH_TO_SIGMA = 1 / 2.355
@@ -379,10 +374,9 @@ class PolarGrid(NamedTuple):
         cell_m: float,
     ) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
-        level_db, seen = np.zeros((2, side, side), np.float32)
         floor = view.level_R_sonar, view.height_m
-        sample_floor(self, image_db, floor, cell_m, centre_m, level_db, seen)
-        return Patch.of(level_db, seen, centre_m)
+        sampled = sample_floor(self, image_db, floor, centre_m, side, cell_m)
+        return Patch.of(*sampled, centre_m)
 
 
 @inlined
@@ -408,11 +402,11 @@ def azimuth(x: float, y: float) -> float:
 
 
 @compiled
-def smooth_levels(
-    level: Floats32, seen: Floats32, smooth: Floats32, held: Floats32
-) -> None:
-    """Fill in means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
+def smooth_levels(level: Floats32, seen: Floats32) -> tuple[Floats32, Floats32]:
+    """Means of the levels seen in 3 by 3 cells, mirrored at the rim, and the shares that are seen."""
     side = len(level)
+    smooth = np.empty((side, side), np.float32)
+    held = np.empty((side, side), np.float32)
     total = np.empty(side + 2, np.float32)
     count = np.empty(side + 2, np.float32)
     for i in range(side):
@@ -432,6 +426,7 @@ def smooth_levels(
             smooth[i, j] = (total[j] + total[j + 1] + total[j + 2]) / max(
                 n, np.float32(0.9)
             )
+    return smooth, held
 
 
 @compiled
@@ -439,19 +434,19 @@ def sample_floor(
     grid: PolarGrid,
     image_db: Floats32,
     floor: tuple[Floats, float],
-    cell_m: float,
     centre: Floats,
-    level: Floats32,
-    seen: Floats32,
-) -> None:
-    """Fill in the levels around a centre, and 1 where a point is in the image, both 0 before.
+    side: int,
+    cell_m: float,
+) -> tuple[Floats32, Floats32]:
+    """Levels of the floor points around a centre, and 1 where a point is in the image; both 0 elsewhere.
 
     Each is the mean of decibels over the bins whose middles a cell covers, or where cells are finer than bins, linear
     between the two nearest; linear between beams. The floor is ``level_R_sonar`` and the sonar's height over it.
     """
     (beams, bins) = image_db.shape
     R, height_m = floor
-    side = len(level)
+    level = np.zeros((side, side), np.float32)
+    seen = np.zeros((side, side), np.float32)
     nodes = grid.beam_of_azimuth
     per_bin = 1 / grid.bin_m
     per_step = 1 / grid.azimuth_step_rad
@@ -514,3 +509,4 @@ def sample_floor(
                     last - first + np.uint32(1)
                 )
             seen[i, j] = 1.0
+    return level, seen

@@ -30,8 +30,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtr
 
 from sonar_graph.calibration import Section
-from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Columns, Floats, Ints
 from sonar_graph.models import project_points, wrap_angle
 from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.sonar.geometry import point_covariances, points
@@ -84,7 +83,7 @@ class SonarStep:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackStates:
+class TrackStates(Columns):
     """States of M tracks, one row each."""
 
     ids: Ints
@@ -106,15 +105,6 @@ class TrackStates:
 
     def __len__(self) -> int:
         return len(self.ids)
-
-    def rows(self, selection: Ints) -> TrackStates:
-        """The selected rows, in this order."""
-        return TrackStates(*(column[selection] for column in vars(self).values()))
-
-    def and_(self, other: TrackStates) -> TrackStates:
-        """These tracks, then the others."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return TrackStates(*(np.concatenate(pair) for pair in pairs))
 
     def moved(self, step: SonarStep, drift_m: float) -> TrackStates:
         """Prediction: the tracks in the sonar frame after a step."""
@@ -251,12 +241,8 @@ class Tracker:
     ) -> Association:
         """Predict the tracks by the motion since the frame before or the last `skip` (None: none), and update them.
 
-        Raises `MeasurementError` when the stamp is not later.
+        Stamps increase: `FrameCheck` refuses other frames.
         """
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            raise MeasurementError(
-                f"sonar frame at {stamp_ns} ns is not later than the one before, {self._stamp_ns} ns; leave it out"
-            )
         params = self.params
         rows = candidates.accepted
         elapsed_s = (
@@ -327,11 +313,12 @@ class Tracker:
         reasons: list[str],
     ) -> Association:
         """Keep the tracks without a reason to end, start new ones, and associate them with the tracks before."""
-        stay = np.flatnonzero([not reason for reason in reasons])
-        ended = np.flatnonzero([bool(reason) for reason in reasons])
-        new = np.array(
-            sorted(set(range(len(matrix))).difference(took.tolist())), dtype=np.int64
-        )
+        is_ended = np.array(reasons, dtype=bool)
+        stay = np.flatnonzero(~is_ended)
+        ended = np.flatnonzero(is_ended)
+        is_new = np.ones(len(matrix), dtype=bool)
+        is_new[took[took >= 0]] = False
+        new = np.flatnonzero(is_new)
         rows = np.append(took[stay], new)
         previous_ids = after.ids
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
@@ -361,11 +348,9 @@ class Tracker:
             )
             ids = self._next_id + np.arange(n)
             self._next_id += n
-            tracks = tracks.and_(
-                TrackStates(
-                    ids, position, covariance, existence, np.ones(n, dtype=np.int64)
-                )
-            )
+            seen = np.ones(n, dtype=np.int64)
+            started = TrackStates(ids, position, covariance, existence, seen)
+            tracks = TrackStates.concatenate([tracks, started])
         self._tracks = tracks
         return Association(
             **vars(tracks),

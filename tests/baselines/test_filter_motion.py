@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import COMPASS, EkfSlam
 from baselines.filter import motion_of
-from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
     Calibration,
     DepthCalibration,
@@ -187,23 +186,3 @@ def test_a_pitch_beyond_the_vertical_is_told_before_the_prediction_folds_it_back
     slam.process(Measurements(later(3.0), depth=seen))
     (told,) = slam.withheld()
     assert told.startswith("pitch came to 103 deg")
-
-
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf])
-def test_frames_in_a_run_of_events_are_what_they_are_one_by_one(kind):
-    """To the last bit, also of a frame with a new landmark after known ones, whose bias is being estimated."""
-    mission = simulate_mission(MissionOptions(seed=3, duration_s=40.0, landmarks=12))
-    calibration = mission.calibration.model_copy(
-        update={"earth_rate_latitude_rad": 0.6}
-    )
-    together = begun(kind, calibration)
-    apart = begun(kind, calibration)
-    apart.setup = apart.setup._replace(follows_frames=False)
-    for window in mission.replay(mission.instants(0.5)):
-        together.process(window)
-        apart.process(window)
-    assert len(together.landmarks()) > 5
-    for one, other in zip(together.state()[1:], apart.state()[1:], strict=True):
-        for numbers, others in zip(one, other, strict=True):
-            np.testing.assert_array_equal(numbers, others)
-    assert together.detections().outcomes == apart.detections().outcomes

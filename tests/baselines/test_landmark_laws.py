@@ -123,18 +123,6 @@ def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
     assert pytest.approx(chi_square_quantile(0.999, 1), abs=5e-3) == FLOOR_GATE
 
 
-@both
-def test_the_innovation_of_azimuth_wraps_around(filter_):
-    sonar = sonar_after(world_at(TILTED), MOTION)
-    world = world_at(TILTED, locate(sonar, 3.0, math.pi - 0.004, 0.1))
-    slam = begun(filter_, world, random_covariance(filter_.bare + 3, 0.002))
-    outcome, e, _ = observe_one(
-        slam, MOTION, 0, np.array([3.0, -math.pi + 0.004]), NOISE
-    )
-    assert outcome == USED
-    assert e[1] == pytest.approx(0.008, abs=1e-9)
-
-
 @pytest.mark.parametrize("hole", [(0, 0), (1, 1), (0, 1)])
 def test_noise_is_the_log_s_or_where_it_is_missing_the_calibration_s(
     hole,
@@ -213,20 +201,6 @@ def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
     assert outcome == GATED
     assert_allclose(at, 0.0, atol=1e-15)
     assert e @ np.linalg.solve(S, e) > chi_square_quantile(0.999, 2)
-
-
-def test_the_noise_of_a_far_view_includes_the_aperture():
-    """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
-    elevation = np.random.default_rng(3).uniform(
-        -APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000
-    )
-    V = far_covariance(np.zeros((2, 2)), 40.0, APERTURE_RAD)
-    assert V[0, 0] == pytest.approx(
-        np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02
-    )
-    assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
-    noise = np.array([[0.04, -0.003], [-0.003, 0.0009]])
-    assert_array_equal(far_covariance(noise, 40.0, 0.0), np.pad(noise, (0, 1)))
 
 
 def test_linear_is_what_errs_by_less_than_the_noise():

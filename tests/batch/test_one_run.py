@@ -17,9 +17,8 @@ from sonar_graph.batch.sources import (
     read_source,
 )
 from sonar_graph.batch.store import PlannedRun
-from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation import compare, read_comparison
+from sonar_graph.evaluation import SCORES, compare, read_comparison
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import (
     BasinOptions,
@@ -42,9 +41,9 @@ def test_scores_are_those_of_compare_bit_for_bit(planned, tmp_path):
         simulate_basin(BasinOptions(duration_s=120, laps=1)), ["isam2"]
     )
     scores = {key: score.value for key, score in comparison.scores["isam2"].items()}
-    assert set(scores) <= set(row) & set(METRICS)
+    assert set(scores) <= set(row) & set(SCORES)
     assert numbers({key: row[key] for key in scores}) == numbers(scores)
-    assert set(row) - set(METRICS) - set(COLUMNS) == {
+    assert set(row) - set(SCORES) - set(COLUMNS) == {
         name for name in row if name.endswith(("_dof", "_end"))
     }
 

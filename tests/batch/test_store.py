@@ -1,10 +1,7 @@
 """Runs are kept whole or not at all, and nothing else is removed with them."""
 
 import contextlib
-import errno
-import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -43,33 +40,6 @@ def test_what_is_written_is_what_is_read(tmp_path):
         )
     ]
     assert (tmp_path / store.log_file("k")).read_text() == "said"
-
-
-@pytest.mark.parametrize("last", range(5))
-def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
-    tmp_path, monkeypatch, last
-):
-    store = Store(tmp_path)
-    store.write("done", OUTCOME)
-    before = names(tmp_path)
-    written = 0
-    write = Path.write_bytes
-    write_text = Path.write_text
-
-    def full(self: Path, *content: Any) -> int:
-        nonlocal written
-        if written == last:
-            write(self, b"half")
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        written += 1
-        return (write if isinstance(content[0], bytes) else write_text)(self, *content)
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match="No space"):
-        store.write("next", OUTCOME)
-    assert names(tmp_path) == before
-    assert not list((tmp_path / "runs").glob(".*"))
 
 
 @pytest.mark.parametrize("act", ["discard", "write"])

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.batch import plan_runs, read_suite
-from sonar_graph.batch.suite import METRICS, line_of
+from sonar_graph.batch.suite import line_of
 from sonar_graph.errors import BatchError
+from sonar_graph.evaluation import SCORES
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
@@ -177,7 +178,7 @@ def test_suites_that_ship_are_sound(path):
     file = read_suite(path)
     assert file.suite.name == path.stem
     assert file.suite.description
-    assert set(file.suite.metrics) <= set(METRICS)
+    assert set(file.suite.metrics) <= set(SCORES)
     if not any(entry.dataset and entry.options for entry in file.suite.logs):
         assert plan_runs(file)
 

@@ -195,39 +195,3 @@ def test_a_refused_command_leaves_no_new_folder(run, dive, tmp_path):
         assert {dive, unreadable, there} == set(tmp_path.iterdir())
         assert not list(there.iterdir())
     assert run("compare", dive, "-o", tmp_path / "made" / "below", *QUICK) == 0
-
-
-OURS = [
-    "recognised/1.jpg",
-    "report.html",
-    "comparison.json",
-]
-THEIRS = [
-    "recognised/mine.jpg",
-    "runs/mine/series.npz",
-    ".log.mcap.partial",
-    ".partial-log.mcap",
-    "log.mcap.part",
-]
-
-
-@pytest.mark.usefixtures("unrendered")
-@pytest.mark.parametrize("ours", [None, *OURS])
-def test_files_of_the_user_below_a_folder_of_results_stay_or_are_named(
-    ours, dive, run, tmp_path, reply
-):
-    folder = tmp_path / "out"
-    mine = [folder / name for name in [*THEIRS, *([ours] if ours else [])]]
-    for path in mine:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("mine")
-    for command in (
-        ("compare", dive, *QUICK),
-        ("run", dive, "--estimator", "dead-reckoning"),
-    ):
-        assert (
-            f"holds {ours}, which sonar-graph did not write"
-            in reply(2 if ours else 0, *command, "-o", folder).err
-        ) == bool(ours)
-    assert run("convert", "dataset", "victoria-park", "-o", folder / "log.mcap") == 0
-    assert {path.read_text() for path in mine} == {"mine"}

@@ -95,7 +95,7 @@ def test_a_folder_gives_all_designs_and_a_missing_file_is_named(
     written(tmp_path, HALF.replace("7", "8").replace("5.0", "6.0"), "b.toml")
     written(tmp_path, HALF, "a.toml")
     assert [design.id for design in load_designs(tmp_path)] == [7, 8]
-    with pytest.raises(CalibrationError, match=r"nowhere\.toml cannot be read"):
+    with pytest.raises(CalibrationError, match=r"nowhere\.toml: cannot be read"):
         load_designs(tmp_path / "nowhere.toml")
 
 
@@ -103,7 +103,7 @@ def test_a_folder_gives_all_designs_and_a_missing_file_is_named(
     ("text", "complaint"),
     [
         ("", "no landmark designs"),
-        ("[[landmark]\n", "is not TOML"),
+        ("[[landmark]\n", "not TOML"),
         (HALF + HALF, "half and half both have the id 7"),
         (
             HALF.replace("size_m = 0.4", "size_m = -1"),

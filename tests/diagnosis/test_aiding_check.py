@@ -10,9 +10,11 @@ from sonar_graph.calibration import Start
 from sonar_graph.diagnosis import Finding, aiding_check, check_sensors
 from sonar_graph.diagnosis.findings import Gravity
 from sonar_graph.diagnosis.motion_signals import BodyMotion
+from sonar_graph.diagnosis.signals import Match
 from sonar_graph.diagnosis.units import force_scale
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import UNMEASURED_M2
+from sonar_graph.measurements import UNMEASURED_M2, Depth
+from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -337,7 +339,72 @@ def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: 
     height_m = np.append(0.0, np.cumsum((np.sin(w * t[1:]) + np.sin(w * t[:-1])) / 2))
     motion = replace(BodyMotion.of(RIGHT), seconds=t, parts=np.zeros(600, int))
     expected = (2 * np.sin(w / 2)) ** 2 / 12
-    assert motion.sampling_error(height_m) == pytest.approx(expected, rel=0.02)
+    sure = Match(*[Estimate1D(1.0, 0.0)] * 3)
+    between = motion.between_rows(sure, height_m)
+    assert between.gain.sigma == pytest.approx(expected, rel=0.02)
+    # a steady motion tells well when
+    assert between.lag.sigma < 0.02
+
+
+@pytest.mark.parametrize("step_m", [0.0, 0.6])
+def test_a_dive_that_turns_between_two_slow_velocities_is_no_jump(step_m: float):
+    """A velocity every two seconds does not tell when the vehicle began to climb; a depth that jumps is found beside it."""
+    t = np.arange(0.0, 240.0, 0.02)
+    climb_m_s = 0.15 * np.tanh(20.0 * np.sin(2 * np.pi * t / 150.0))
+    velocity = np.column_stack([0.5 + 0.0 * t, 0.0 * t, climb_m_s])
+    run = level_vehicle(velocity, 0.1 * np.sin(0.1 * t), 0)
+    run = replace(run, dvl=run.dvl.rows(slice(0, None, 10)))
+    z_m = np.cumsum(climb_m_s) * 0.02 + step_m * (t > 100.0)
+    stamps_ns = run.imu.stamps_ns[::10]
+    run = replace(run, depth=Depth(stamps_ns, z_m[::10], np.full(len(stamps_ns), 1e-4)))
+    texts = [found.cause for found in acting(run) if found.quantity.startswith("depth")]
+    assert len(texts) == (step_m > 0)
+    assert all("jumps" in text for text in texts)
+
+
+def test_sensors_without_noise_are_not_stuck_where_the_vehicle_rests():
+    """There the gyros and the Doppler log move by noise alone, and an exact compass, depth and fix do not follow."""
+    t = np.arange(0.0, 300.0, 0.02)
+    moves = (t < 60.0) | (t > 280.0)
+    rate = 0.1 * moves * np.sin(0.2 * t)
+    yaw_rad = np.cumsum(rate) * 0.02
+    body = np.column_stack([0.5 * moves, 0.0 * t, 0.1 * moves * np.sin(0.1 * t)])
+    run = level_vehicle(body, rate, 0)
+    level = 0.5 * moves * np.exp(1j * yaw_rad)
+    way = np.column_stack([level.real, level.imag, body[:, 2]])
+    places = np.cumsum(way, axis=0)[::10] * 0.02
+    stamps_ns = run.imu.stamps_ns[::10]
+    exact = replace(
+        run,
+        depth=Depth(stamps_ns, places[:, 2], np.full(len(stamps_ns), 1e-6)),
+        heading=heading_rows(stamps_ns, yaw_rad[::10]),
+        positions=fix_rows(stamps_ns, places),
+    )
+    assert not acting(exact)
+
+
+@pytest.mark.parametrize("changes", [2, 8])
+def test_a_climb_that_begins_between_two_velocities_tells_badly_when(changes: int):
+    """Each sudden change may be anywhere in its two seconds; so many of them tell better by the root of their number."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 600.0, 2.0)
+    motion = replace(BodyMotion.of(RIGHT), seconds=t, parts=np.zeros(300, int))
+    sure = Match(*[Estimate1D(1.0, 0.0)] * 3)
+    late_s = []
+    for _ in range(200):
+        begins_s = np.sort(rng.uniform(20.0, 580.0, changes))
+        fine_s = np.arange(0.0, 600.0, 0.01)
+        climb_m_s = 0.1 * (-1.0) ** np.searchsorted(begins_s, fine_s)
+        true_m = np.append(0.0, np.cumsum(climb_m_s) * 0.01)[:-1][::200]
+        at_rows = climb_m_s[::200]
+        height_m = np.append(0.0, np.cumsum(at_rows[1:] + at_rows[:-1]))
+        sigma_s = motion.between_rows(sure, height_m).lag.sigma
+        off_m = np.diff(height_m - true_m)
+        # each change moves the height by twice the speed times its delay
+        late_s.append(
+            np.sum(off_m * np.sign(np.diff(true_m))) / 0.2 / changes / sigma_s
+        )
+    assert 0.5 < np.std(late_s) < 1.5
 
 
 @pytest.mark.parametrize("late_s", [0.0, 1.0])

@@ -14,7 +14,7 @@ from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_un
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.vehicle_setup import unplaced
 from sonar_graph.measurements import Floats, Imu
-from sonar_graph.navigation.alignment import DvlMatch, Estimate1D, InitialTilt
+from sonar_graph.navigation.alignment import Estimate1D, InitialTilt
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -106,30 +106,6 @@ def test_the_start_is_aligned_with_what_was_found_before(
         found = found_in_spoilt[f"start {name}: value"].estimate.value
         assert found == pytest.approx(np.degrees(angle_rad), abs=0.1)
     assert find_start_tilt(spoilt_log()).tilt is None
-
-
-@pytest.mark.parametrize("acts", [True, False])
-def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
-    shift_s, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
-    none, offset, turn, factor = (
-        Estimate1D(value, 1e-5) for value in (0.0, shift_s, yaw, scale)
-    )
-    unknown = DvlMatch.unknown("too little turning")
-    match = replace(unknown, offset=offset, turn=(none, none, turn), scale=factor)
-    run = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
-    rows = sensor_check.dvl_findings(match, run, LogConfig())
-    assert [row.acts for row in rows] == [acts] * 3
-    # that of a sample's instant
-    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3)
-    found = sensor_check.corrected_sequence(run, match, rows)
-    if acts:
-        run = late(run, "dvl", 0.4)
-        run = spoilt(run, "dvl", velocity=1.04 * run.dvl.velocity)
-        run = with_mounting(run, "dvl", rpy_rad=(0.3, 0.1, 0.25))
-    assert (found.dvl.stamps_ns == run.dvl.stamps_ns).all()
-    assert found.dvl.velocity == pytest.approx(run.dvl.velocity)
-    rpy_rad = run.calibration.dvl.mounting.rpy_rad
-    assert found.calibration.dvl.mounting.rpy_rad == pytest.approx(rpy_rad)
 
 
 def test_a_unit_is_added_to_the_scale_of_the_configuration():

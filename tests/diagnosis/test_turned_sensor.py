@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Start
 from sonar_graph.diagnosis.turned_sensor import TurnedPair
-from sonar_graph.navigation.alignment import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
@@ -139,15 +138,6 @@ def turned_pair(run: Sequence, role: str) -> TurnedPair:
     turn_rad = np.pi / 2 if role == "dvl" else -np.pi / 2
     turned = with_turned(run, role, np.pi / 2)
     return TurnedPair(turned, np.array([0.0, 0.0, turn_rad]))
-
-
-def test_without_a_third_sensor_both_are_named() -> None:
-    pair = turned_pair(with_only("heading"), "imu")
-    finding = pair.finding("DVL axes", Estimate1D.unknown("wrong axes"), "turned")
-    assert finding.grave
-    assert "no other sensor shows which" in finding.advice
-    for name in ("imu", "dvl"):
-        assert f"`{name}.mounting.rpy_rad" in finding.line
 
 
 def test_a_heading_may_come_from_the_turned_imu() -> None:

@@ -98,24 +98,6 @@ def test_a_result_folder_is_readable_without_this_package(
                 assert b"'descr': '|O'" not in archive.read(name)[:200], name
 
 
-def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
-    write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
-    (tmp_path / "runs" / "other" / "my notes.txt").write_text("kept")
-    (tmp_path / "runs" / "broken").mkdir()
-    (tmp_path / "runs" / "broken" / "trajectory.tum").write_text(
-        "of a run that another program did"
-    )
-    write_comparison(comparison, tmp_path)
-    assert [path.name for path in (tmp_path / "runs" / "other").iterdir()] == [
-        "my notes.txt"
-    ]
-    assert (tmp_path / "runs" / "broken" / "trajectory.tum").exists()
-    assert [run.estimator for run in read_comparison(tmp_path).runs] == [
-        "offset",
-        "broken",
-    ]
-
-
 def test_no_page_of_an_earlier_comparison_stays_beside_later_numbers(
     comparison, folder
 ):
@@ -127,26 +109,6 @@ def test_no_page_of_an_earlier_comparison_stays_beside_later_numbers(
     page.write_text("mine")
     write_comparison(comparison, folder)
     assert page.read_text() == "mine"
-
-
-def test_an_interrupted_writing_leaves_the_earlier_comparison_as_it_was(
-    comparison, monkeypatch, tmp_path
-):
-    write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-
-    def fail(_path: Path, _: Any) -> None:
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr("sonar_graph.evaluation.storage.write_landmarks_csv", fail)
-    with pytest.raises(OSError, match="no space"):
-        write_comparison(comparison, tmp_path)
-    assert {
-        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()
-    } == before
-    with pytest.raises(OSError, match="no space"):
-        write_comparison(comparison, tmp_path / "new")
-    assert not (tmp_path / "new").exists()
 
 
 def test_a_name_that_leaves_the_folder_is_refused(comparison, tmp_path):

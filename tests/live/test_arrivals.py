@@ -6,7 +6,7 @@ import pytest
 from sonar_graph import Depth, Dvl, Imu
 from sonar_graph.errors import MeasurementError
 from sonar_graph.live import Arrivals
-from sonar_graph.live.arrivals import AHEAD, LATE, REPEATED
+from sonar_graph.live.arrivals import AHEAD, LATE
 
 MS = 1_000_000
 
@@ -64,18 +64,6 @@ def test_a_frame_without_detections_says_that_none_will_come():
     assert ends_ms(arrivals) == []
     arrivals.add(*no_detection(120))
     assert ends_ms(arrivals) == [100]
-
-
-def test_rows_go_to_the_step_of_their_stamp_whatever_their_order():
-    arrivals = given(dvl(0), imu(110), imu(0), imu(40), dvl(105), imu(20))
-    (step,) = arrivals.steps()
-    assert (step.imu.stamps_ns // MS).tolist() == [0, 20, 40]
-    assert (step.dvl.stamps_ns // MS).tolist() == [0]
-
-
-def test_of_rows_with_one_stamp_the_first_counts():
-    arrivals = given(imu(0), dvl(0), imu(50))
-    assert arrivals.add(*imu(50)) == REPEATED
 
 
 def test_a_stamp_ahead_of_its_arrival_is_refused_and_makes_no_other_late():

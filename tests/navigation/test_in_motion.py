@@ -22,7 +22,6 @@ from .ways import acceleration_at, attitude, rate_at, velocity_at
 
 T = np.arange(round(15.0 * 100) + 1) / 100
 G = 9.80665
-HZ = 100
 DVL_EVERY = 20
 EARTH = 7.292115e-5
 LATITUDE = np.radians(40.0)

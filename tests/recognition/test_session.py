@@ -20,7 +20,13 @@ from sonar_graph.recognition import (
     with_detections,
 )
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
-from sonar_graph.sonar import REPORTED, IdentityParams, RecogniserParams, confusion_for
+from sonar_graph.sonar import (
+    REPORTED,
+    IdentityParams,
+    Recogniser,
+    RecogniserParams,
+    confusion_for,
+)
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 SURE = 0.9
@@ -52,7 +58,8 @@ def accepted(lane: Lane, found: LandmarkDetections) -> set[tuple[int, int]]:
 def recognised(
     lane: Lane, frames: Iterable[SonarFrames] | None = None, **settings: object
 ) -> Recognition:
-    session = RecognitionSession(lane.sequence, pictures=False, **settings)
+    recogniser = Recogniser(lane.sequence.calibration, **settings)
+    session = RecognitionSession(lane.sequence, recogniser)
     for frame in one_by_one(lane.frames) if frames is None else frames:
         session.take(frame)
     return session.finish()

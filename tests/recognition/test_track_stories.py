@@ -7,7 +7,7 @@ import pytest
 
 from sonar_graph.recognition import Recognition, RecognitionSession, TrackStories
 from sonar_graph.recognition.track_stories import MOST_EXAMPLES
-from sonar_graph.report.tracks import write_track_page
+from sonar_graph.report import write_track_page
 from sonar_graph.sonar import Recogniser
 from tests.recognition.imaged_lane import Lane
 
@@ -18,11 +18,9 @@ NAMES = ["1: disc", "2: square", "3: triangle", "4: cross"]
 def told(lane: Lane) -> tuple[Recognition, TrackStories]:
     recogniser = Recogniser(lane.sequence.calibration)
     stories = TrackStories(lane.sequence.calibration.sonar.image)
-    session = RecognitionSession(
-        lane.sequence, recogniser=recogniser, pictures=False, seen=stories.see
-    )
-    for row in range(len(lane.frames)):
-        session.take(lane.one(row))
+    session = RecognitionSession(lane.sequence, recogniser)
+    for frame, result in session.run([lane.frames]):
+        stories.see(frame, result)
     return session.finish(), stories
 
 

@@ -20,8 +20,7 @@ from sonar_graph.evaluation import (
 )
 from sonar_graph.recognition import with_detections
 from sonar_graph.report import sentences, write_page, write_report
-from sonar_graph.report.comparison_page import recognition_content, render_report
-from sonar_graph.table import Table
+from sonar_graph.report.comparison_page import render_report
 from tests.synthetic import (
     basin_comparison,
     only,
@@ -268,11 +267,6 @@ def test_a_filter_as_published_is_named_so_with_its_fair_neighbour(comparison):
     assert "The fair neighbour" not in Page(render_report(comparison)).text
 
 
-def texts(table: Table) -> dict[str, list[str]]:
-    """The texts of each row by its first cell."""
-    return {row[0].text: [cell.text for cell in row[1:]] for row in table.rows}
-
-
 @pytest.fixture(scope="module")
 def recognised(lane, lane_recognition) -> Comparison:
     """Some runs, with the sequence and the recognition of a lane."""
@@ -280,26 +274,31 @@ def recognised(lane, lane_recognition) -> Comparison:
     return replace(basin_comparison(), sequence=sequence, recognition=lane_recognition)
 
 
+def recognition_in(page: str) -> str:
+    """The section about sonar images."""
+    return page.split('<h2 id="recognition"')[1].split("</section>")[0]
+
+
+@pytest.mark.usefixtures("unrendered")
 def test_the_section_shows_pictures_and_counts(recognised, lane_recognition):
-    content = recognition_content(recognised)
-    assert content["frames"] == lane_recognition.frames
-    assert texts(content["outcomes"]) == {
-        outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()
-    }
-    assert len(content["pictures"]) == len(lane_recognition.shown()) == 4
-    first = content["pictures"][0]
+    section = Page(f"<h2{recognition_in(render_report(recognised))}")
+    assert f"{lane_recognition.frames} sonar images gave" in section.text
+    for outcome, n in lane_recognition.outcomes.items():
+        assert f"{outcome} {n}" in section.text
+    pictures = section.named("img")
+    assert len(pictures) == len(lane_recognition.shown()) == 4
     shown = lane_recognition.shown()[0]
-    address = first["address"].removeprefix("data:image/jpeg;base64,")
+    address = pictures[0]["src"].removeprefix("data:image/jpeg;base64,")
     assert base64.b64decode(address) == shown.jpeg
     seconds = (shown.stamp_ns - recognised.sequence.start_ns) * 1e-9
-    assert first["caption"].startswith(f"T = {seconds:.1f} s: ")
+    caption = " ".join(pictures[0]["alt"].split())
+    assert caption.startswith(f"Sonar image. T = {seconds:.1f} s: ")
     for landmark, probability in zip(
         shown.landmark_ids, shown.probabilities, strict=True
     ):
-        assert f"ID {landmark} ({probability:.2f})" in first["caption"]
-    assert recognition_content(basin_comparison()) is None, (
-        "a comparison without images"
-    )
+        assert f"ID {landmark} ({probability:.2f})" in caption
+    without = render_report(basin_comparison())
+    assert 'id="recognition"' not in without, "a comparison without images"
 
 
 @pytest.mark.usefixtures("unrendered")
@@ -308,9 +307,8 @@ def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
     warned = replace(
         recognised, recognition=replace(recognised.recognition, warnings=warnings)
     )
-    content = recognition_content(warned)
-    assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
-    page = render_report(warned).split('<h2 id="recognition"')[1].split("</section>")[0]
+    page = recognition_in(render_report(warned))
+    assert "1.25 <b> & so on" in Page(f"<h2{page}").text
     assert all(shown in page for shown in ("1.25", "&lt;b&gt; &amp; so on"))
     assert "<b> & so on" not in page
     assert page.count("data:image/jpeg;base64,") == 4

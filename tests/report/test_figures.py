@@ -33,10 +33,7 @@ from sonar_graph.report.figures import (
 )
 from sonar_graph.report.figures.error_figures import errors_cut_off, shares_in_band
 from sonar_graph.report.figures.maps import (
-    ENLARGED,
-    LARGEST_ELLIPSE,
     enlargement,
-    map_view,
 )
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
@@ -279,36 +276,6 @@ def test_ellipses_are_as_large_as_the_caption_says():
     )
     caption = drawing_of(comparison, "growth").caption
     assert f"drawn {factor} times as large" in caption
-
-
-@pytest.mark.parametrize("number", range(len(ENLARGED)))
-@pytest.mark.parametrize("is_just_too_large", [False, True])
-def test_ellipses_are_as_large_as_the_figure_has_room_for(number, is_just_too_large):
-    """By the widest ellipse of the maps that are drawn; heights and maps of other instants do not count."""
-    comparison = grown()
-    room_m = LARGEST_ELLIPSE * np.ptp(map_view(comparison), axis=0).max()
-    largest_m = room_m / ENLARGED[number] / np.sqrt(chi2.ppf(0.95, 2))
-    sigma_m = largest_m * (1.001 if is_just_too_large else 0.999)
-    runs = []
-    for run in comparison.runs:
-        maps = list(run.maps)
-        if maps:
-            covariances = np.tile((sigma_m / 3) ** 2 * np.eye(3), (4, 1, 1))
-            covariances[1] = np.diag([sigma_m**2, 0.0, 1e6])
-            maps = [
-                replace(
-                    known,
-                    landmarks=replace(
-                        known.landmarks, covariances=covariances[: len(known.landmarks)]
-                    ),
-                )
-                for known in maps
-            ]
-            between = replace(maps[-1].landmarks, covariances=1e4 * covariances)
-            maps.append(MapSoFar(maps[0].stamp_ns + 1, between))
-        runs.append(replace(run, maps=maps))
-    expected = ENLARGED[max(number - is_just_too_large, 0)]
-    assert enlargement(replace(comparison, runs=runs)) == expected
 
 
 @pytest.mark.usefixtures("unrendered")

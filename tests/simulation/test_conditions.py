@@ -27,8 +27,6 @@ from sonar_graph.simulation.sonar_image import (
 from sonar_graph.simulation.sonar_image.scene import CELL_M, CELLS, scatterers
 from sonar_graph.simulation.sonar_image.strangers import GROUPS
 
-TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
-
 GOLDEN = [
     [68, 98, 140, 138, 139, 103, 109, 98, 66],
     [109, 131, 148, 129, 127, 136, 99, 113, 105],

@@ -57,29 +57,6 @@ def imu_of(
     return imu.angular_velocity, imu.specific_force - [0, 0, G]
 
 
-def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
-    path = moving()
-    step = 1e-3
-    begins = np.arange(0, 10 - step / 2, step)
-    # Its integrator holds rate and force over a step and turns the force by the attitude at the step's begin.
-    omegas, _ = sensors.imu_readings(path.at(begins + step / 2), Mounting(), G)
-    _, forces = sensors.imu_readings(path.at(begins), Mounting(), G)
-    params = gtsam.PreintegrationParams.MakeSharedU(G)
-    no_bias = gtsam.imuBias.ConstantBias()
-    integrated = gtsam.PreintegratedImuMeasurements(params, no_bias)
-    for omega, force in zip(omegas, forces, strict=True):
-        integrated.integrateMeasurement(force, omega, step)
-    first = path.at(np.array([0.0]))
-    last = path.at(np.array([10.0]))
-    pose = gtsam.Pose3(gtsam.Rot3(first.world_R_body.as_matrix()[0]), first.position[0])
-    end = integrated.predict(gtsam.NavState(pose, first.velocity[0]), no_bias)
-    np.testing.assert_allclose(end.position(), last.position[0], atol=2e-3)
-    np.testing.assert_allclose(end.velocity(), last.velocity[0], atol=5e-4)
-    np.testing.assert_allclose(
-        end.attitude().matrix(), last.world_R_body.as_matrix()[0], atol=1e-5
-    )
-
-
 def points_of_mounting(
     path: VehiclePath, seconds: Floats, lever: tuple[float, float, float]
 ) -> Floats:

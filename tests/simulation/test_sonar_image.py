@@ -1,6 +1,7 @@
 """Simulated images obey the laws that real ones obey, each with its switch."""
 
 from copy import copy
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -27,7 +28,7 @@ PLAIN = ImageOptions(
     cross_talk_db=None, tvg_error_db=0.0, texture_shape=None, joints=False, multipath=False, noise_db=None,
     drop_probability=0.0,
 )  # fmt: skip
-EVEN = SONARS["didson"].model_copy(update={"lens_cubic": None})
+EVEN = replace(SONARS["didson"], lens_cubic=None)
 """The same sonar with equally spaced beams."""
 
 
@@ -128,9 +129,7 @@ def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(
     Square of the autocorrelation of a two-way aperture (a triangle): the cubic B-spline, half of it after 3.6 cm.
     """
     # one looks straight ahead
-    sonar = EVEN.model_copy(
-        update={"beams": 9, "azimuth_span_rad": np.radians(0.3 * 9)}
-    )
+    sonar = replace(EVEN, beams=9, azimuth_span_rad=np.radians(0.3 * 9))
     made = simulator(sonar=sonar, speckle=speckle)
     across_m = np.sqrt(2.0**2 - HEIGHT_M**2)
     turned = Rotation.from_euler("Z", -np.arctan2(moved_m, across_m)) * TILT
@@ -228,7 +227,7 @@ def point_response(**changes: object) -> np.ndarray:
 def test_first_side_lobe_lies_26_decibels_down_and_can_be_switched_off():
     width_rad = 0.886 / 0.8859 * np.radians(0.3)
     first_lobe = 1.43 * width_rad / 0.886
-    fine = EVEN.model_copy(update={"beams": 960})
+    fine = replace(EVEN, beams=960)
     offset = np.linspace(0.8, 2.0, 2000) * width_rad / 0.886
     pattern_db = 20 * np.log10(fine.two_way_pattern(offset, True))
     outside = offset > 1.0 * width_rad / 0.886
@@ -291,7 +290,7 @@ def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypa
     middle = image[sonar.beams // 2 - 5 : sonar.beams // 2 + 5, 250:350]
     # the mean of decibels: 2.5 below
     assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)
-    other = sonar.model_copy(update={"decibel_span": 64.0})
+    other = replace(sonar, decibel_span=64.0)
     monkeypatch.setitem(SONARS, name, other)
     options = BasinOptions(duration_s=120.0, laps=1, image=ImageOptions(sonar=name))
     said = simulate_basin(options).calibration.sonar.image
@@ -301,7 +300,7 @@ def test_every_sonar_makes_images_of_its_size_and_logs_their_span(name, monkeypa
 @pytest.mark.parametrize("span", [80.0, 100.0])
 def test_counts_are_decibels_over_the_span(span: float):
     made = FrameSimulator(
-        PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span})
+        PLAIN, (), 0.0, 3, replace(SONARS["didson"], decibel_span=span)
     )
     counts = made.frame(ABOVE, TILT, 0)
     inside = (counts > 0) & (counts < 255)

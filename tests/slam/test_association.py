@@ -10,11 +10,6 @@ from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.models import ACCEPTED, identify
-from sonar_graph.slam.landmarks.mixture import (
-    LEAST_LANDMARKS,
-    IdentityPosterior,
-    RecogniserErrors,
-)
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide
 from sonar_graph.slam.landmarks.unknown import (
     UNPAIRED,
@@ -74,29 +69,6 @@ def test_the_most_probable_identity_is_accepted(
     assert outcomes.tolist() == [
         ACCEPTED if why is None else OUTCOME_NUMBERS[why] for why in refusals
     ]
-
-
-CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4).map(
-    lambda p: [x / max(sum(p), 1.0) for x in p]
-)
-
-
-def statement(ids: list[int], probability: list[float]) -> IdentityPosterior:
-    return IdentityPosterior.of(stated([0], ids, [probability]), 0)
-
-
-@given(CHANCES, st.floats(0.001, 0.999), st.integers(LEAST_LANDMARKS, 60))
-def test_weights_are_a_distribution_with_none_impossible(
-    chances: list[float], q: float, count: int
-) -> None:
-    ids = list(range(count))
-    weights = np.exp(
-        statement(ids[: len(chances)], chances).log_weights(
-            ids, RecogniserErrors(wrong_id_probability=q)
-        )
-    )
-    assert weights.sum() == pytest.approx(1.0)
-    assert weights.min() >= min(0.5 * q / count, 0.5 * q) * (1 - 1e-9)
 
 
 @pytest.mark.parametrize(

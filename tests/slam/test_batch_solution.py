@@ -20,7 +20,6 @@ from .made import (
     pose_prior,
     scattered,
     smoother_with,
-    values_of,
 )
 
 
@@ -95,24 +94,6 @@ def smoother_at(
 
 def seen(*sightings: np.ndarray) -> Sightlines:
     return {L(1): [Sightline(X(0), BODY_T_SONAR, z) for z in sightings]}
-
-
-def test_behind_begins_at_a_right_angle_to_what_was_measured():
-    camera = factors.landmark_sighting(
-        X(0), L(1), BODY_T_SONAR, Z, np.diag([1e-4, 1e-4]), plain
-    )["azimuth"]
-    for off_rad in [*np.linspace(-3, 3, 25), -1.57, 1.57, 1.572]:
-        values = values_of(X0=POSE, L1=world_point(5.0, Z[1] + off_rad))
-        is_behind = abs(off_rad) > np.pi / 2
-        assert misplaced(values, seen(Z)) == ([L(1)] if is_behind else [])
-        assert np.any(camera.linearize(values).jacobian()[0]) != is_behind
-
-
-def test_a_landmark_is_misplaced_if_behind_half_of_its_sightings():
-    values = values_of(X0=POSE, L1=world_point(*Z))
-    opposite = np.array([2.0, Z[1] + np.pi])
-    assert misplaced(values, seen(Z, opposite)) == [L(1)]
-    assert misplaced(values, seen(Z, opposite, Z)) == []
 
 
 @pytest.mark.parametrize("wrong", [4, 6])

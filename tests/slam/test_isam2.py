@@ -1,8 +1,5 @@
 """The estimator against its batch solution, on the basin, on MRCLAM and on faulty streams; its settings."""
 
-from dataclasses import replace
-from functools import partial
-from itertools import product
 from typing import Any
 
 import gtsam
@@ -14,17 +11,16 @@ from scipy.stats import chi2
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.estimator import make_params
 from sonar_graph.evaluation import normalised_squares
-from sonar_graph.logs.convert import read_mrclam
-from sonar_graph.measurements import NS_PER_S, Floats
+from sonar_graph.measurements import Floats
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate
-from sonar_graph.testing import check_consistent, laws, small_world, still_world
+from sonar_graph.testing import check_consistent, small_world, still_world
 
 from .graphs import gtsams_solution
-from .made import isam2_params, ran
+from .made import ran
 
 BASIN_S = 130.0
 
@@ -32,29 +28,6 @@ BASIN_S = 130.0
 @pytest.fixture(scope="module")
 def basin() -> Sequence:
     return simulate_basin(BasinOptions(duration_s=BASIN_S, laps=1, seed=3))
-
-
-def same(one: Estimate, other: Estimate) -> bool:
-    return (
-        one.stamp_ns == other.stamp_ns
-        and np.array_equal(one.world_T_body.matrix(), other.world_T_body.matrix())
-        and np.array_equal(one.covariance, other.covariance)
-    )
-
-
-def until(sequence: Sequence, end_ns: int) -> Sequence:
-    """The log, had it been cut off there."""
-    blocks = {
-        name: getattr(sequence, name) for name in ("imu", "dvl", "depth", "detections")
-    }
-    return replace(
-        sequence,
-        **{
-            name: rows.between(0, end_ns)
-            for name, rows in blocks.items()
-            if rows is not None
-        },
-    )
 
 
 def assert_is_batch(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
@@ -93,17 +66,6 @@ def test_incremental_equals_batch_in_the_basin(kernel, bias):
     assert_is_batch(estimator.graph, estimator.values)
 
 
-@pytest.mark.slow
-@pytest.mark.recording
-def test_incremental_equals_batch_on_mrclam(unpacked):
-    folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
-    whole = read_mrclam(folder, 1)
-    sequence = until(whole, whole.start_ns + 300 * NS_PER_S)
-    estimator, _ = ran(sequence, **PRECISE, smoother__relinearize_threshold=1e-3)
-    assert len(poses_in(estimator.values)) > 100
-    assert_is_batch(estimator.graph, estimator.values)
-
-
 def test_the_final_answer_is_the_batch_solution(basin):
     """Trajectory and landmarks with the default settings; the requested instants are the keyframes' and others."""
     estimator, _ = ran(basin, 7.0)
@@ -122,15 +84,6 @@ def test_the_final_answer_is_the_batch_solution(basin):
     )
     assert np.median(nearest) < 1e-3
     assert estimator.values.equals(before, 0.0)
-
-
-@pytest.mark.parametrize("cut_s", [17.3, 64.0])
-def test_nothing_peeks_ahead(basin, cut_s):
-    """Estimates until t are the same, to the bit, from a log that ends at t."""
-    end_ns = basin.start_ns + round(cut_s * NS_PER_S)
-    whole, cut = (ran(s)[1] for s in (basin, until(basin, end_ns)))
-    assert len(cut) > 25
-    assert all(same(a, b) for a, b in zip(whole, cut[:-1], strict=False))
 
 
 def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
@@ -178,42 +131,6 @@ def test_noise_of_zero_is_refused_by_name(basin, section, name):
     )
     with pytest.raises(CalibrationError, match=f"{section}.{name}"):
         Isam2(calibration, Odometry(calibration))
-
-
-LAG_S = 3.0
-"""Much less than the worlds last: what is wrong leaves the window before it is known to be."""
-QUICK = ["robust bounded associate"]
-ALL = [
-    "max-mixture whole ignore",
-    *map(
-        " ".join,
-        product(("gate", "robust"), ("whole", "bounded"), ("ignore", "associate")),
-    ),
-]
-SLOW = [
-    pytest.param(chosen, marks=pytest.mark.slow)
-    for chosen in ALL
-    if chosen not in QUICK
-]
-
-
-def settings(policy: str, history: str, unknown_landmarks: str) -> Any:
-    unknown = (
-        {"identity__unknown__policy": "associate"}
-        if unknown_landmarks == "associate"
-        else {}
-    )
-    return isam2_params(
-        identity__policy=policy,
-        history__policy=history,
-        smoother__lag_s=LAG_S,
-        **unknown,
-    )
-
-
-@pytest.mark.parametrize("chosen", [*QUICK, *SLOW])
-def test_asking_changes_nothing(chosen: str) -> None:
-    laws.asking_changes_nothing(partial(Isam2, params=settings(*chosen.split())))
 
 
 def test_the_newest_landmarks_are_those_of_the_window(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 
 from sonar_graph.calibration import FloorPrior
 from sonar_graph.models import Kernel
@@ -19,8 +19,6 @@ from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
 from sonar_graph.slam.landmarks.mixture import (
     TrackedObject,
 )
-from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.smoother import Sightline
 from sonar_graph.states import Outcome
 
 from . import test_mixture as small
@@ -118,18 +116,6 @@ def test_a_landmark_that_begins_in_a_wrong_place_is_moved(
     off_m = float(np.linalg.norm(values.atPoint3(L(7)) - PLACES[7]))
     assert (off_m < 0.1) is can_move
     assert world.outcomes.count(Outcome.UNFIT) == (1 if can_move else 6)
-
-
-def sighting(
-    k: int, z: list[float], pose: int = 0, floor: FloorPrior | None = None
-) -> Sighting:
-    return Sighting(
-        k,
-        k,
-        Sightline(X(pose), gtsam.Pose3(), np.array(z)),
-        np.diag([4e-4, 1e-4]),
-        floor,
-    )
 
 
 def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:

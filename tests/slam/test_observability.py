@@ -1,8 +1,6 @@
 """Directions left open, rows that are no measurements, and factors that are withheld."""
 
 import re
-from dataclasses import replace
-from functools import cache
 from itertools import product
 
 import gtsam
@@ -11,19 +9,12 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.measurements import Measurements
-from sonar_graph.navigation import Odometry
-from sonar_graph.sequence import Sequence
-from sonar_graph.simulation import MissionOptions, simulate_mission
-from sonar_graph.slam import Isam2, factors
+from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import FactorGroup, Factors, Smoother
 from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open
-from sonar_graph.states import Estimate, Outcome, Refusal
 
 from .made import (
-    estimates_of,
     graph_of,
-    isam2_params,
     isotropic,
     plain,
     point_prior,
@@ -59,94 +50,6 @@ def test_a_range_leaves_open_what_is_across_it() -> None:
     assert left_open(graph_of([distance, *weak]), HERE, [L(1)]) == []
     (left,) = left_open(graph_of([distance, *weak]), HERE, [L(1)], LEAST_SAID)
     assert left.axes() == "z"
-
-
-@cache
-def mission() -> Sequence:
-    return simulate_mission(MissionOptions(duration_s=30.0, imu="mti1"))
-
-
-def run(sequence: Sequence) -> tuple[Isam2, list[Estimate]]:
-    params = isam2_params(smoother__lag_s=8.0, smoother__waiting_gain=0.0)
-    estimator = Isam2(sequence.calibration, Odometry(sequence.calibration), params)
-    return estimator, estimates_of(estimator, sequence, 1.0)
-
-
-def numbers(outcome: tuple[Isam2, list[Estimate]]) -> np.ndarray:
-    """Causal, smoothed and landmarks' estimates with their covariances."""
-    estimator, estimates = outcome
-    smoothed = estimator.trajectory()
-    landmarks = estimator.landmarks()
-    columns = [
-        np.array([e.world_T_body.matrix() for e in estimates]),
-        np.array([e.covariance for e in estimates]),
-    ]
-    columns += [
-        smoothed.positions,
-        smoothed.covariances,
-        landmarks.positions,
-        landmarks.covariances,
-    ]
-    return np.concatenate([column.ravel() for column in columns])
-
-
-FAULTS = [
-    ("detections", 40, "range_azimuth_cov", np.zeros((2, 2))),
-    ("detections", 45, "range_azimuth_cov", np.full((2, 2), 1e-4)),
-    ("detections", 50, "range_azimuth_cov", np.diag([np.inf, 1e-4])),
-    ("detections", 55, "range_m", 0.0),
-    ("dvl", 40, "velocity_cov", np.diag([1e-4, 1e-4, -1e-4])),
-    ("depth", 40, "variance_m2", 0.0),
-    ("depth", 45, "variance_m2", np.inf),
-]
-
-
-def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
-    fine, late = (
-        Isam2(mission().calibration, Odometry(mission().calibration)) for _ in range(2)
-    )
-    for step in mission().replay(mission().instants(0.5)):
-        half_ns = (step.depth.stamps_ns[0] + step.depth.stamps_ns[-1]) // 2
-        parts = step.depth.between(0, half_ns), step.depth.between(half_ns, step.end_ns)
-        now = replace(step, depth=parts[1])
-        estimates = fine.process(now), late.process(now)
-        for estimator, estimate in zip((fine, late), estimates, strict=True):
-            assert estimate is not None
-            estimator.process(
-                replace(step, imu=None, dvl=None, detections=None, depth=None)
-            )
-        late.process(Measurements(step.end_ns, depth=parts[0]))
-    assert np.array_equal(fine.trajectory().positions, late.trajectory().positions)
-    assert not fine.refused_rows()
-    assert {(row.sensor, row.reason) for row in late.refused_rows()} == {
-        ("depth", Refusal.LATE)
-    }
-
-
-def test_rows_that_are_no_measurements_are_refused_and_change_nothing():
-    spoilt = whole = mission()
-    for sensor, row, column, value in FAULTS:
-        block = getattr(spoilt, sensor)
-        values = getattr(block, column).copy()
-        values[row] = value
-        spoilt = replace(spoilt, **{sensor: replace(block, **{column: values})})
-    stamps_ns = {sensor: [] for sensor, *_ in FAULTS}
-    for sensor, found in stamps_ns.items():
-        block = getattr(mission(), sensor)
-        rows = [row for name, row, *_ in FAULTS if name == sensor]
-        found += block.stamps_ns[rows].tolist()
-        left = np.delete(np.arange(len(block)), rows)
-        whole = replace(whole, **{sensor: block.rows(left)})
-    faulty = run(spoilt)
-    assert np.array_equal(numbers(faulty), numbers(run(whole)))
-    log = faulty[0].detections()
-    is_unsound = [outcome is Outcome.UNSOUND for outcome in log.outcomes]
-    assert log.stamps_ns[is_unsound].tolist() == stamps_ns.pop("detections")
-    assert len(log) == len(mission().detections)
-    refused = faulty[0].refused_rows()
-    assert all(row.reason is Refusal.UNSOUND for row in refused)
-    for sensor, found in stamps_ns.items():
-        assert [row.stamp_ns for row in refused if row.sensor == sensor] == found
 
 
 @pytest.mark.parametrize(

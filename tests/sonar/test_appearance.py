@@ -27,7 +27,6 @@ from .polar_images import (
     ROTATION,
     VIEW,
     design_of,
-    floor_points,
     image_db,
     level_R_sonar,
     odds,
@@ -91,25 +90,6 @@ def test_foam_that_stands_up_shows_its_near_side():
         np.testing.assert_allclose(
             brighter_mm[10:65], 0.0 if heading_rad else 13.5, atol=1.5
         )
-
-
-def test_a_patch_shows_what_a_search_along_rays_finds():
-    rotation = level_R_sonar(np.radians(29), np.radians(3))
-    centre = np.array([1.75, 0.02])
-    xy, lit = floor_points(rotation)
-    view = FloorView(rotation, HEIGHT_M)
-    cells_m = 0.015 * (np.arange(21) - 10)
-    for axis, expected in enumerate(
-        np.meshgrid(centre[0] + cells_m, centre[1] + cells_m, indexing="ij")
-    ):
-        image = np.where(lit, 100 * xy[..., axis], 0).astype(np.float32)
-        turned = PolarGrid.of(RANGES_M, AZIMUTHS_RAD[::-1])
-        for patch in (
-            GRID.patch(image, view, centre, 21, 0.015),
-            turned.patch(image[::-1], view, centre, 21, 0.015),
-        ):
-            assert (patch.seen == 1).all()
-            np.testing.assert_allclose(patch.level_db / 100, expected, atol=2e-3)
 
 
 def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
@@ -317,30 +297,6 @@ def test_evidence_is_that_of_least_squares_over_the_cells_in_view(rim: int, blur
         }
     assert has == {*EVIDENCE} - ({"bare"} if figures.has_dark.all() else set())
     assert is_edge == {True, False}
-
-
-def on_floor(design: LandmarkDesign) -> LandmarkDesign:
-    """Its bright figure without the plate."""
-    return replace(design, mask=np.where(design.mask > 0, design.mask, np.nan))
-
-
-@pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
-def test_a_plate_that_is_not_seen_is_no_evidence_against_a_design(appearance, design):
-    seen, unseen = (
-        _fit(
-            appearance,
-            image_db(one, (1.7, 0.0), 0.3, ROTATION, np.random.default_rng(2)),
-            (1.7, 0.0),
-        )
-        for one in (design, on_floor(design))
-    )
-    plate = EVIDENCE.index("plate")
-    assert (
-        unseen.evidence[design.id - 1, plate]
-        < 0.5 * seen.evidence[design.id - 1, plate]
-    )
-    assert odds(unseen).argmax() == design.id - 1
-    assert odds(unseen).max() > 0
 
 
 def drawn(figure: Floats) -> LandmarkDesign:

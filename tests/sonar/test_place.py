@@ -23,7 +23,7 @@ from sonar_graph.sonar.appearance import (
     CandidateFit,
     DesignFit,
 )
-from sonar_graph.sonar.place import Grid, Lit, Relief
+from sonar_graph.sonar.place import Grid, Lit, Relief, fit_place
 from sonar_graph.sonar.templates import Patch, check_headings
 
 from .polar_images import candidates_at, design_of
@@ -64,10 +64,11 @@ def place_in(
     patch: Floats, start: tuple[float, float], seen: Floats | None = None
 ) -> tuple[Floats, Floats]:
     held = np.ones_like(patch) if seen is None else seen
-    return RELIEF.place(
+    return fit_place(
+        RELIEF,
         Patch.of(patch, held, np.zeros(2)),
         ROWS_COLUMNS,
-        np.array(start),
+        np.array(start, float),
         Lit(SIDE_M, LONGER),
     )
 

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal
 
-from sonar_graph.errors import MeasurementError
 from sonar_graph.sonar import SonarStep
 from sonar_graph.sonar.tracker import (
     Expected,
@@ -154,24 +152,6 @@ def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
     assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
 
 
-def test_innovations_wrap_behind_the_sonar():
-    R = np.diag([1e-4, 1e-6])
-    tracks = track_at([-2.0, 1e-3, 0.0], 1e-4 * np.eye(3))
-    expected = Expected.of(tracks, R)
-    turned = np.array([[2.0, -np.pi + 5e-4]])
-    plain = np.array([[2.0, np.pi + 5e-4]])
-    density = expected.densities(turned, 9.0)[0, 0]
-    assert density == pytest.approx(
-        multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9
-    )
-    one, other = (
-        corrected(tracks, expected, z, np.array([0]), R).position_m
-        for z in (turned, plain)
-    )
-    assert one == pytest.approx(other, abs=1e-12)
-    assert one[0, 1] < 0  # on the other side of the axis
-
-
 def test_a_correction_is_that_of_the_information_form():
     """P^-1 grows by H^T R^-1 H; H by differences of range and azimuth."""
     q = np.array([1.9, 0.2, -0.3])
@@ -204,11 +184,3 @@ def test_what_leaves_the_image_ends_and_is_not_held_against_it(inside_m, ahead):
     assert out.ended_ids.tolist() == before.ids.tolist() or out.existence[0] > 0.99
     gone = tracker.step(candidates_at([], []), moved_by(0.3 * ahead), 21 * FRAME_NS)
     assert "left the image" in out.ended_reasons + gone.ended_reasons
-
-
-def test_frames_that_are_not_later_are_refused():
-    tracker = Tracker()
-    run(tracker, [[(2.0, 0.0)]])
-    for later_ns in (0, -1):
-        with pytest.raises(MeasurementError, match="not later"):
-            tracker.step(candidates_at([2.0], [0.0]), STILL, FRAME_NS + later_ns)

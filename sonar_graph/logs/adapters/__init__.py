@@ -11,7 +11,7 @@ from sonar_graph.logs.adapters.geodesy import Origin, east_north_up
 from sonar_graph.logs.adapters.landmark_messages import DetectionRowsAdapter, LandmarkRowsAdapter
 from sonar_graph.logs.adapters.landmark_messages import detection_warnings, range_and_azimuth
 from sonar_graph.logs.adapters.log_config import (
-    LogConfig, as_log_config, changes_text, plain_lines, read_log_config, read_toml, shipped_for, shipped_like, table_text,
+    LogConfig, as_log_config, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
 from sonar_graph.logs.adapters.message_table import (
     LAST_S, Dropped, FieldTable, Mask, MessageTable, field_of,
@@ -25,5 +25,5 @@ __all__ = [
     "Mask", "MessageTable", "Origin", "PRESSURES", "RATES", "Refused", "SAMPLE_TYPES", "SHIPPED", "SPEEDS", "Setup",
     "Shipped", "SonarAdapter", "TIMES", "TRUTH_WORDS", "Z_DOWN_TYPES", "as_log_config", "axes_matrix", "body_to_ros",
     "changes_text", "detection_warnings", "did_you_mean", "east_north_up", "field_of", "leaf_fields", "plain_lines",
-    "range_and_azimuth", "read_log_config", "read_toml", "samples_of_rows", "shipped_for", "shipped_like", "table_text",
+    "range_and_azimuth", "read_log_config", "samples_of_rows", "shipped_for", "shipped_like", "table_text",
 ]

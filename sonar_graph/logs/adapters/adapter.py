@@ -8,7 +8,16 @@ and conventions. A message type is added without code, as an instance of that su
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    NewType,
+    Self,
+    get_args,
+)
 
 import numpy as np
 from pydantic import (
@@ -148,11 +157,14 @@ class Setup(NamedTuple):
     """Latitude and longitude (degrees) and height (m) of the world's origin, for positions on the Earth."""
 
 
-class PathSection(Section):
-    """Section with paths of fields, an adapter or a part of one."""
+FieldPath = NewType("FieldPath", str)
+"""Name of a field with values in every message."""
+FieldPaths = tuple[FieldPath, FieldPath, FieldPath]
+"""Fields of x, y and z."""
 
-    PATHS: ClassVar[tuple[str, ...]] = ()
-    """Attributes with paths that a message must have."""
+
+class PathSection(Section):
+    """Section with paths of fields, an adapter or a part of one; those of type `FieldPath` a message must have."""
 
     EITHER: ClassVar[tuple[tuple[str, str, str], ...]] = ()
     """Pairs of attributes of which one must be given, with the words for both."""
@@ -166,23 +178,24 @@ class PathSection(Section):
 
     def fields_used(self) -> Iterator[str]:
         """Paths that a message must have, except for the stamp's; their fields have the same size in all messages."""
-        return field_paths(*(getattr(self, name) for name in self.PATHS))
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, PathSection):
+                yield from value.fields_used()
+            elif "FieldPath" in str(field.annotation):
+                yield from field_paths(value)
 
 
-def field_paths(*values: str | Iterable[str] | PathSection | None) -> Iterator[str]:
-    """Paths in attributes of an adapter, each one path, several, or none."""
-    for value in values:
-        if isinstance(value, PathSection):
-            yield from value.fields_used()
-        else:
-            yield from (value,) if isinstance(value, str) else value or ()
+def field_paths(value: str | Iterable[str] | None) -> Iterable[str]:
+    """Paths in an attribute of an adapter: one path, several, or none."""
+    return (value,) if isinstance(value, str) else value or ()
 
 
 class Adapter(PathSection):
     """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
 
-    A subclass adds the attributes of its role, names those that hold paths in `PATHS`, and gives the measurements, with
-    the number of rows left out by reason, in ``read(table, setup)``.
+    A subclass adds the attributes of its role, and gives the measurements, with the number of rows left out by reason,
+    in ``read(table, setup)``.
     """
 
     LISTS: ClassVar[tuple[str, ...]] = ()
@@ -277,9 +290,7 @@ ROUNDING = 1e-6
 class CovarianceFields(PathSection):
     """Fields of a covariance, and the meaning of their numbers."""
 
-    PATHS = ("fields",)
-
-    fields: tuple[str, ...] = Field(min_length=1, max_length=3)
+    fields: tuple[FieldPath, ...] = Field(min_length=1, max_length=3)
     """One field: a row-major matrix (3x3, or the first three rows of 6x6), or one number for all axes.
     Three fields: one an axis, each a number or a row."""
     meaning: Literal["variance", "standard deviation"] = "variance"

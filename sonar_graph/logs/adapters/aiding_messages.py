@@ -5,10 +5,8 @@ a yaw of ``90° - β`` in a world with x east. Fixes in latitude and longitude b
 origin (`sonar_graph.logs.adapters.geodesy`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -18,6 +16,8 @@ from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
     CovarianceFields,
+    FieldPath,
+    FieldPaths,
     LengthScale,
     PathSection,
     Setup,
@@ -58,12 +58,11 @@ _WHOLE_CIRCLE = 2 * np.pi + 0.1
 class HeadingAdapter(Adapter):
     """Yaw of the body, from an orientation or from one angle."""
 
-    PATHS = ("orientation", "yaw", "variance", "status")
     EITHER = (("orientation", "yaw", "orientation = [x, y, z, w] or yaw"),)
 
-    orientation: tuple[str, str, str, str] | None = None
+    orientation: tuple[FieldPath, FieldPath, FieldPath, FieldPath] | None = None
     """Fields of the quaternion's x, y, z, w: the sensor in the world."""
-    yaw: str | None = None
+    yaw: FieldPath | None = None
     """Field with an angle instead: of the body, positive to the left from the world's x."""
     scale: AngleScale = 1.0
     """Turns the angle into rad; 0.017453292519943295 or "deg" from degrees."""
@@ -75,7 +74,7 @@ class HeadingAdapter(Adapter):
     """One field with the yaw's variance, rad²; without it, or where not above 0, the calibration's noise holds."""
     needs_variance: bool = False
     """Messages that state no variance are no measurements: drivers fill orientations that nothing measured."""
-    status: str | None = None
+    status: FieldPath | None = None
     """Field that is -1 where the orientation was not measured."""
 
     def accepts(self, fault: str) -> str | None:
@@ -179,17 +178,15 @@ class Places(NamedTuple):
 class GeodeticFields(PathSection):
     """Fields of a position on the Earth, and the origin of the world."""
 
-    PATHS = ("latitude", "longitude", "height", "status")
-
-    latitude: str
+    latitude: FieldPath
     """Degrees, north."""
-    longitude: str
+    longitude: FieldPath
     """Degrees, east."""
     unit: Literal["deg", "degE7", "ddmm.mmmm", "rad"] = "deg"
     """Of both: "degE7" for integers of 1e-7 degrees (MAVLink, u-blox), "ddmm.mmmm" for degrees and minutes (NMEA)."""
-    height: str | None = None
+    height: FieldPath | None = None
     """Metres above the ellipsoid, or any other level; none, or not finite: not measured."""
-    status: str | None = None
+    status: FieldPath | None = None
     """Field that is negative where there is no fix."""
     origin_deg_m: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and height (m) of the world's origin; none: those of the first fix in the log."""
@@ -260,7 +257,6 @@ class GeodeticFields(PathSection):
 class PlaceAdapter(Adapter):
     """Positions, in latitude and longitude or in metres of the world."""
 
-    PATHS: ClassVar[tuple[str, ...]] = ("position", "geodetic")
     EITHER = (
         (
             "geodetic",
@@ -270,7 +266,7 @@ class PlaceAdapter(Adapter):
     )
     geodetic: GeodeticFields | None = None
     """Fields of a position on the Earth."""
-    position: tuple[str, str, str] | None = None
+    position: FieldPaths | None = None
     """Fields of x, y, z in the world instead, metres."""
     scale: LengthScale = 1.0
     """Turns `position` into metres, and its covariance by the square; 0.001 or "mm" from millimetres."""
@@ -294,13 +290,11 @@ class PlaceAdapter(Adapter):
 class PositionAdapter(PlaceAdapter):
     """Fixes of an antenna or transponder, in latitude and longitude or in metres of the world."""
 
-    PATHS = ("geodetic", "position", "covariance", "covariance_type")
-
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """World's origin in the scaled coordinates of `position`, such as that of a run in a map grid (UTM)."""
     covariance: CovarianceFields | None = None
     """Along the world's axes; without it the calibration's noise holds."""
-    covariance_type: str | None = None
+    covariance_type: FieldPath | None = None
     """Field that is 0 where the covariance is unknown."""
 
     def scaled(self, table: FieldTable) -> Floats:

@@ -20,6 +20,8 @@ from sonar_graph.devices import velocity_of_beams
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     CovarianceFields,
+    FieldPath,
+    FieldPaths,
     PathSection,
     Setup,
     SpeedScale,
@@ -44,11 +46,9 @@ FEWEST_BEAMS = 3
 class BeamGeometry(PathSection):
     """Velocities along the beams, from which that of the vehicle is computed."""
 
-    PATHS = ("velocity", "valid")
-
-    velocity: str
+    velocity: FieldPath
     """Array field with one velocity a beam, positive along the beam."""
-    valid: str | None = None
+    valid: FieldPath | None = None
     """Array field that is 0 where a beam is not to be used."""
     tilt_deg: float = Field(gt=0, lt=90)
     """Angle between beams and the instrument's vertical: 30 (RDI), 25 (Nortek), 22.5 (Water Linked)."""
@@ -115,28 +115,19 @@ Masks = dict[str, Mask]
 class DvlAdapter(Adapter):
     """Velocity over the bottom in the instrument's frame."""
 
-    PATHS = (
-        "velocity",
-        "covariance",
-        "valid_where",
-        "good_beams",
-        "altitude",
-        "beams",
-    )
-
-    velocity: tuple[str, str, str] | None = None
+    velocity: FieldPaths | None = None
     """Fields of the velocity along x, y, z; not used with `beams`."""
     scale: SpeedScale = 1.0
     """Turns it into m/s; 0.001 or "mm/s" from mm/s, -1 where the driver gives the bottom's velocity."""
     covariance: CovarianceFields | None = None
     """Of the velocity, before `scale`; without it the calibration's noise holds."""
-    valid_where: Mapping[str, Number] = {}
+    valid_where: Mapping[FieldPath | str, Number] = {}
     """Fields, each with its value in messages to be used: {velocity_mode = 1}."""
     may_be_unfilled: tuple[str, ...] = ()
     """Fields that some drivers never fill: where one is 0 in every message, it does not count."""
-    good_beams: str | None = None
+    good_beams: FieldPath | None = None
     """Field that counts good beams; messages with none are left out."""
-    altitude: str | None = None
+    altitude: FieldPath | None = None
     """Field that is negative without bottom lock. It counts where `valid_where` is the same in all messages."""
     are_zeros_measured: bool = False
     """true: a velocity of exactly 0 is measured also where it comes in one step, as without bottom lock."""

@@ -17,6 +17,8 @@ from pydantic import model_validator
 from sonar_graph.logs.adapters.adapter import (
     Adapter,
     AngleScale,
+    FieldPath,
+    FieldPaths,
     LengthScale,
     Setup,
     turn,
@@ -354,33 +356,23 @@ def detection_warnings(
 class DetectionRowsAdapter(Adapter):
     """Range, azimuth and identity of one detection a row; rows of one sonar frame share a stamp."""
 
-    PATHS = (
-        "range",
-        "azimuth",
-        "ids",
-        "probabilities",
-        "range_sigma",
-        "azimuth_sigma",
-        "track",
-    )
-
-    range: str
+    range: FieldPath
     """Field with the slant range."""
     range_scale: LengthScale = 1.0
     """Turns it into metres; 0.001 or "mm" from millimetres."""
-    azimuth: str
+    azimuth: FieldPath
     """Field with the azimuth in the sonar's frame, positive to the left; with rotation = "frd" to the right."""
     azimuth_scale: AngleScale = 1.0
     """Turns it into rad; 0.017453292519943295 or "deg" from degrees."""
-    ids: tuple[str, ...] | None
+    ids: tuple[FieldPath, ...] | None
     """Fields with the identities that the recogniser considers: integers; empty, or -1: unknown; false: no field."""
-    probabilities: tuple[str, ...] = ()
+    probabilities: tuple[FieldPath, ...] = ()
     """Fields with the posterior of each identity, at most 1 in sum; without it, or where empty, 1 for the first."""
-    range_sigma: str | None = None
+    range_sigma: FieldPath | None = None
     """Field with the range's standard deviation, before its scale; without it the calibration's noise holds."""
-    azimuth_sigma: str | None = None
+    azimuth_sigma: FieldPath | None = None
     """The same of the azimuth."""
-    track: str | None = None
+    track: FieldPath | None = None
     """Field with the number of the track; none, or -1: no track."""
 
     @model_validator(mode="after")
@@ -444,11 +436,9 @@ class DetectionRowsAdapter(Adapter):
 class LandmarkRowsAdapter(Adapter):
     """Identity and true position of one landmark a row; without stamps."""
 
-    PATHS = ("id", "position")
-
-    id: str
+    id: FieldPath
     """Field with the identity, an integer."""
-    position: tuple[str, str, str]
+    position: FieldPaths
     """Fields of x, y, z in the world."""
     scale: LengthScale = 1.0
     """Turns them into metres; 0.001 or "mm" from millimetres."""

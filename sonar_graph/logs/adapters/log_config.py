@@ -11,7 +11,6 @@ the shipped adapter has (docs/tutorials/04_your_own_log.md)::
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from pydantic import ValidationError
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
-from sonar_graph.files import as_path, text_of
+from sonar_graph.files import as_path, read_toml
 from sonar_graph.logs.adapters.adapter import UNITS, Adapter, did_you_mean, leaf_fields
 from sonar_graph.logs.adapters.drivers import ADAPTERS, SHIPPED
 from sonar_graph.logs.adapters.message_table import LOG_TIME, field_of
@@ -188,18 +187,7 @@ def read_log_config(path: Path) -> LogConfig:
 
     A LogError where it cannot be read, is not TOML, or states something impossible; it names table and key.
     """
-    return LogConfig.parse(read_toml(path), str(path))
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file; a LogError where it cannot be read, or is not TOML."""
-    try:
-        return tomllib.loads(text_of(path))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    # the parser recurses into nested arrays
-    except (ValueError, RecursionError) as error:
-        raise LogError(f"{path}: not TOML: {error}") from error
+    return LogConfig.parse(read_toml(path, LogError), str(path))
 
 
 def as_log_config(value: LogConfig | str | Path | None, call: str) -> LogConfig | None:

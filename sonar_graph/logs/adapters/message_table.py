@@ -34,8 +34,6 @@ class FieldTable(ABC):
 
     stamps_ns: Ints
     """Shape (n,)."""
-    source: str
-    """Name for sentences, such as "topic /dvl"."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -74,7 +72,6 @@ class MessageTable(FieldTable):
         stamp_offset_s: float = 0.0,
     ) -> None:
         self.topic = topic
-        self.source = f"topic {topic.name}"
         self.groups = topic.messages()
         if not self.groups:
             faults = ", ".join(

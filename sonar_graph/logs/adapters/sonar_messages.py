@@ -1,7 +1,5 @@
 """Adapter for imaging sonars: messages as frames of intensities over beams and range bins."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from sonar_graph.images import SonarFrames
-from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.adapter import Adapter, FieldPath, FieldPaths
 from sonar_graph.logs.adapters.message_table import MessageTable
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
@@ -57,37 +55,36 @@ def samples_of_rows(
 class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
-    PATHS = ("data", "ranges", "range_resolution", "bearings", "directions", *KINDS)
     EITHER = (
         ("ranges", "range_resolution", "ranges or range_resolution"),
         ("bearings", "directions", "bearings or directions"),
     )
-    data: str
+    data: FieldPath
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"
     """range-major: all beams of the first range, then of the next, which is what drivers do (also where the message's
     comment states otherwise); beam-major: all ranges of the first beam first."""
-    ranges: str | None = None
+    ranges: FieldPath | None = None
     """Array field with the middle of each range bin, metres."""
-    range_resolution: str | None = None
+    range_resolution: FieldPath | None = None
     """Field with the size of a range bin, instead: bins then begin at the sonar."""
-    bearings: str | None = None
+    bearings: FieldPath | None = None
     """Array field with an angle a beam."""
     bearing_unit_deg: float = Field(180 / np.pi, gt=0)
     """Unit of a bearing in degrees; 0.01 where they are given in hundredths."""
     bearing_positive: Literal["left", "right"] = "right"
     """Side of the sonar with positive bearings."""
-    directions: tuple[str, str, str] | None = None
+    directions: FieldPaths | None = None
     """Array fields with x, y, z of each beam's direction, instead: z forward, x up, y to the right."""
-    sample_type: str | None = None
+    sample_type: FieldPath | None = None
     """Field with the kind of a sample as marine_acoustic_msgs counts them (0: u8, 1: i8, 2: u16, ... 9: f64)."""
-    sample_bytes: str | None = None
+    sample_bytes: FieldPath | None = None
     """Field with the number of bytes of an unsigned sample, instead; without either they are bytes."""
-    big_endian: str | None = None
+    big_endian: FieldPath | None = None
     """Field that states whether samples are big-endian."""
-    row_gains: str | None = None
+    row_gains: FieldPath | None = None
     """Field that states whether each row begins with its gain, a uint32; samples are divided by its square root."""
-    row_bytes: str | None = None
+    row_bytes: FieldPath | None = None
     """Field with the number of bytes of a row, gain and padding included."""
 
     def read(

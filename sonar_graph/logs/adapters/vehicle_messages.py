@@ -22,6 +22,8 @@ from sonar_graph.logs.adapters.adapter import (
     AngleScale,
     CovarianceFields,
     DepthScale,
+    FieldPath,
+    FieldPaths,
     ForceScale,
     RateScale,
     Setup,
@@ -44,7 +46,6 @@ from sonar_graph.logs.adapters.message_table import (
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
 
-Paths = tuple[str, str, str]
 WITHOUT_RATE = "without angular rate"
 LEAST_MOVE_M = 1.0
 """A vehicle that moved less may not have turned."""
@@ -70,21 +71,19 @@ class _Signals(NamedTuple):
 class ImuAdapter(Adapter):
     """Angular rate and specific force."""
 
-    PATHS = ("angular_velocity", "linear_acceleration", *STATUSES)
-
-    angular_velocity: Paths
+    angular_velocity: FieldPaths
     """Fields of the rates about x, y, z."""
     angular_velocity_scale: RateScale = 1.0
     """Turns them into rad/s; 0.017453292519943295 or "deg/s" from degrees."""
     angular_velocity_axes: SignedAxes | None = None
     """Rates alone, after `rotation`: the axis of each, ["x", "y", "-z"] where the driver has yaw with the wrong sign."""
-    angular_velocity_status: str | None = None
+    angular_velocity_status: FieldPath | None = None
     """Field that is -1 where the rate was not measured."""
-    linear_acceleration: Paths | None
+    linear_acceleration: FieldPaths | None
     """Fields of the specific force along x, y, z, which accelerometers measure: +9.81 upwards at rest; false: none."""
     linear_acceleration_scale: ForceScale = 1.0
     """Turns them into m/s²; 9.80665 or "g" from g, -1 where the driver gives gravity's own direction."""
-    linear_acceleration_status: str | None = None
+    linear_acceleration_status: FieldPath | None = None
     """Field that is -1 where it was not measured."""
     are_zeros_measured: bool = False
     """true: an acceleration of 0 is a value even where all messages have it; else the driver does not fill it."""
@@ -181,12 +180,11 @@ def _changes(values: Floats) -> bool:
 class DepthAdapter(Adapter):
     """Height of the pressure port, from a pressure or from a field in metres."""
 
-    PATHS = ("pressure", "height", "variance")
     EITHER = (("pressure", "height", "pressure or height"),)
 
-    pressure: str | None = None
+    pressure: FieldPath | None = None
     """Field with a pressure."""
-    height: str | None = None
+    height: FieldPath | None = None
     """Field with a height, instead: metres, upwards; with scale = -1 a depth, downwards."""
     scale: DepthScale = 1.0
     """Turns the field into Pa or into metres upwards; 100 or "hPa" from hPa and mbar."""
@@ -240,12 +238,10 @@ class TruthAdapter(PlaceAdapter):
     From world and body axes of the driver (``w``, ``b``) to those of this package: ``R = enu_R_w w_R_b ours_R_b^T``.
     """
 
-    PATHS = ("position", "geodetic", "orientation", "rpy")
-
     frame_id_field: str | None = None
-    orientation: tuple[str, str, str, str] | None = None
+    orientation: tuple[FieldPath, FieldPath, FieldPath, FieldPath] | None = None
     """Fields of the quaternion's x, y, z, w; false: only positions are true, and no heading is scored."""
-    rpy: Paths | None = None
+    rpy: FieldPaths | None = None
     """Fields of roll, pitch, yaw instead: world_R_body = Rz(yaw) Ry(pitch) Rx(roll), along the driver's axes."""
     rpy_scale: AngleScale = 1.0
     """Turns them into rad; 0.017453292519943295 or "deg" from degrees."""

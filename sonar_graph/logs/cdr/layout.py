@@ -21,6 +21,7 @@ from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache
+from itertools import groupby
 from struct import Struct as Packing
 from typing import Any, NamedTuple
 
@@ -53,7 +54,7 @@ class DecodingStep(ABC):
         self.path = path
 
     @abstractmethod
-    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
+    def take(self, at: int, layout: Layout) -> int:
         """Note the place of the part at byte ``at``; returns the byte after it."""
 
 
@@ -87,7 +88,7 @@ class FieldBlock(DecodingStep):
                 at += size * value.number
             self._sizes[phase] = at - start
 
-    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:  # noqa: ARG002  # of all steps
+    def take(self, at: int, layout: Layout) -> int:
         """Note the start of the block, before any padding."""
         layout.found[self].append(at)
         return at + self._sizes[at % _PHASES]
@@ -101,9 +102,9 @@ class Counted(DecodingStep):
         self.is_text = is_text
         self._size = np.dtype(kind).itemsize
 
-    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
+    def take(self, at: int, layout: Layout) -> int:
         """Note the place of the first value and their count; the NUL that closes a string is one."""
-        at, count = layout.counted(self, at, length_of)
+        at, count = layout.counted(self, at)
         # numbers are aligned where there is one, and texts need no step for it
         if count and self._size > 1:
             at += padding(at, self._size)
@@ -119,13 +120,11 @@ class Repeated(DecodingStep):
         self._count = count
         self._steps = steps
 
-    def take(self, at: int, layout: Layout, length_of: LengthOf) -> int:
+    def take(self, at: int, layout: Layout) -> int:
         """Note the start and count of the elements, and walk through them."""
         # a fixed array has no length word
         at, count = (
-            layout.counted(self, at, length_of)
-            if self._count is None
-            else (at, self._count)
+            layout.counted(self, at) if self._count is None else (at, self._count)
         )
         layout.found[self] += (at, count)
         if count > layout.most_elements:
@@ -133,7 +132,7 @@ class Repeated(DecodingStep):
             return at + count
         for _ in range(count):
             for step in self._steps:
-                at = step.take(at, layout, length_of)
+                at = step.take(at, layout)
         return at
 
 
@@ -163,37 +162,41 @@ class Plan:
     def _compile(
         self, definition: Struct, prefix: str, *, is_single: bool
     ) -> list[DecodingStep]:
+        """Steps of a type, of which neighbouring values of fixed number are one."""
         steps: list[DecodingStep] = []
-        values: list[Value] = []
-        self._add(definition, prefix, is_single, steps, values)
-        self._close(steps, values)
+        parts = self._parts(definition, prefix, is_single)
+        for kind, run in groupby(parts, type):
+            found = list(run)
+            steps += [self._block(found)] if kind is Value else found
         return steps
 
-    def _add(
-        self,
-        definition: Struct,
-        prefix: str,
-        is_single: bool,
-        steps: list[DecodingStep],
-        values: list[Value],
-    ) -> None:
+    def _parts(self, definition: Struct, prefix: str, is_single: bool) -> Iterator[Any]:
+        """Values of fixed number, and steps for all else."""
         if not definition.fields:
-            values.append(Value(prefix, "u1", 1, is_single))
+            yield Value(prefix, "u1", 1, is_single)
         for entry in definition.fields:
             path = prefix + entry.name
             single = is_single and not entry.is_array
             # a nested type is part of the block: CDR has no mark where it begins
             if isinstance(entry.kind, Struct) and not entry.is_array:
-                self._add(entry.kind, path + ".", single, steps, values)
+                yield from self._parts(entry.kind, path + ".", single)
             elif (
                 isinstance(entry.kind, str)
                 and entry.kind != STRING
                 and entry.length is not None
             ):
-                values.append(Value(path, PRIMITIVES[entry.kind], entry.length, single))
+                yield Value(path, PRIMITIVES[entry.kind], entry.length, single)
             else:
-                self._close(steps, values)
-                steps.append(self._step(entry, path, single))
+                yield self._step(entry, path, single)
+
+    def _block(self, values: list[Value]) -> FieldBlock:
+        """A step for some values, each of which is then known by its path."""
+        block = FieldBlock(values)
+        for path, kind, _, is_single in values:
+            # a type without fields has a byte that is no field
+            if path and not path.endswith("."):
+                self.leaves[path] = Leaf(block, kind, is_single)
+        return block
 
     def _step(self, entry: Field, path: str, is_single: bool) -> DecodingStep:
         if isinstance(entry.kind, Struct):
@@ -210,17 +213,6 @@ class Plan:
         repeated = Repeated(path, entry.length, inner)
         self.sequences[path] = repeated
         return repeated
-
-    def _close(self, steps: list[DecodingStep], values: list[Value]) -> None:
-        """Make a block of the values gathered so far."""
-        if values:
-            block = FieldBlock(values)
-            steps.append(block)
-            for path, kind, _, is_single in values:
-                # a type without fields has a byte that is no field
-                if path and not path.endswith("."):
-                    self.leaves[path] = Leaf(block, kind, is_single)
-            values.clear()
 
 
 @lru_cache(maxsize=256)
@@ -268,16 +260,17 @@ class Layout:
         self.most_elements = most_elements
         """An array of more would reach beyond the end of the payload."""
         self._places: dict[str, PayloadColumn] = {}
+        self._length_of = length_of
         self.size = HEADER_BYTES
         for step in plan.steps:
-            self.size = step.take(self.size, self, length_of)
+            self.size = step.take(self.size, self)
+        # it refers to the payload, which a layout that is remembered must not keep in memory
+        del self._length_of
 
-    def counted(
-        self, step: DecodingStep, at: int, length_of: LengthOf
-    ) -> tuple[int, int]:
+    def counted(self, step: DecodingStep, at: int) -> tuple[int, int]:
         """Byte after a step's length word, and the value of the word."""
         at += -at % LENGTH_BYTES  # as much as after the header, which is as long
-        count = length_of(step, at)
+        count = self._length_of(step, at)
         self.words.append((at, count))
         return at + LENGTH_BYTES, count
 
@@ -310,7 +303,7 @@ class Layout:
         places, expected = self._distinction
         every = len(rows) == len(payloads)
         some = payloads[:, places] if every else payloads[np.ix_(rows, places)]
-        return np.asarray((some == expected).all(axis=1))
+        return (some == expected).all(axis=1)
 
     @cached_property
     def _distinction(self) -> tuple[Ints, Bytes]:

@@ -12,16 +12,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import (
-    Calibration,
-    DvlCalibration,
-    ImuCalibration,
-    Mounting,
-    Start,
-)
+from sonar_graph.calibration import Calibration
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.adapters import ENU_R_NED, east_north_up
-from sonar_graph.logs.convert.text_tables import numbered_run, read_table
+from sonar_graph.logs.convert.text_tables import DATA_SETS, numbered_run, read_table
 from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
@@ -33,14 +27,6 @@ DVL_DELAY_NS = NS_PER_S
 FLU_OF_FRD = np.array([1.0, -1.0, -1.0])
 IMU_FRD_SIGNS = np.array([1.0, -1.0, 1.0])
 """Signs that turn the IMU's own axes into forward, right, down."""
-# Estimated from trajectories 1 to 7 against the reference (docs/theory/datasets.md).
-GYRO_NOISE_DENSITY = 2e-5
-GYRO_BIAS_SIGMA_RAD_S = 3e-6
-GYRO_BIAS_WALK_DENSITY = 1e-8
-VELOCITY_SIGMA_M_S = (0.01, 0.01, 0.005)
-BODY_P_DVL_M = (-1.84, 0.03, -0.1)
-BODY_P_IMU_M = (-1.76, 0.01, 0.1)
-START_RPY_SIGMA_RAD = (0.01, 0.01, 0.03)
 LEAST_POSES = 30
 OFFSETS_S = np.arange(-1.0, 1.005, 0.01)
 """Offsets of the reference's stamps that are tried."""
@@ -160,26 +146,13 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     start = truth.at(np.array([start_ns]))
     x, y, z = start.positions[0].tolist()
     yaw, pitch, roll = start.rotations().as_euler("ZYX")[0].tolist()
-    calibration = Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=GYRO_NOISE_DENSITY,
-            gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
-            gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
-            mounting=Mounting(translation_m=BODY_P_IMU_M),
-        ),
-        dvl=DvlCalibration(
-            velocity_sigma_m_s=VELOCITY_SIGMA_M_S,
-            mounting=Mounting(translation_m=BODY_P_DVL_M),
-        ),
-        start=Start(
-            position_m=(x, y, z),
-            rpy_rad=(roll, pitch, yaw),
-            rpy_sigma_rad=START_RPY_SIGMA_RAD,
-        ),
-        use_gravity=False,  # at 2 m/s a turn feels like a tilt of degrees, while the gyros drift by hundredths
-        odometry_interpolation="linear",
-        earth_rate_latitude_rad=float(latitude[0]),
-    )
+    known = DATA_SETS["akit"]
+    pose = {"position_m": (x, y, z), "rpy_rad": (roll, pitch, yaw)}
+    of_run = {
+        "start": known["start"] | pose,
+        "earth_rate_latitude_rad": float(latitude[0]),
+    }
+    calibration = Calibration.model_validate(known | of_run)
     return Sequence(
         name=f"akit_trajectory{trajectory}",
         calibration=calibration,

@@ -154,4 +154,4 @@ def is_absent(vectors: Floats) -> NDArray[np.bool_]:
     # one component may well be zero
     if vectors.shape[1] == 1:
         return is_empty
-    return np.asarray(is_empty | (np.ptp(vectors, axis=1) == 0))
+    return is_empty | (np.ptp(vectors, axis=1) == 0)

@@ -22,23 +22,23 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import STANDARD_GRAVITY, Calibration
 from sonar_graph.errors import LogError
-from sonar_graph.files import as_path, spelt
+from sonar_graph.files import as_path, read_toml, spelt
 from sonar_graph.logs.adapters import (
     ADAPTERS,
     Adapter,
     DetectionRowsAdapter,
     DvlAdapter,
     LandmarkRowsAdapter,
+    Setup,
     did_you_mean,
     plain_lines,
-    read_toml,
 )
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.convert.csv_evidence import marked_valid, time_units
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
-from sonar_graph.logs.reading import common_origin, require_use, rows_of
+from sonar_graph.logs.reading import common_origin, require_use
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.settings import faults_in, toml_key
@@ -137,7 +137,8 @@ def _as_names(kind: type[Adapter], key: str, value: Any) -> Any:
     """Numbers of columns as names, where a key of an adapter names columns."""
     field = kind.model_fields.get(key)
     # a key without texts has numbers of its own, such as an angle
-    if field is None or "str" not in str(field.annotation):
+    texts = "" if field is None else str(field.annotation)
+    if "str" not in texts and "FieldPath" not in texts:
         return value
     if isinstance(value, list):
         return [_as_names(kind, key, item) for item in value]
@@ -192,7 +193,7 @@ def read_csv(
     values = config
     if not isinstance(values, Mapping):
         source = str(config)
-        values = read_toml(as_path(config, "read_csv(tables, config)"))
+        values = read_toml(as_path(config, "read_csv(tables, config)"), LogError)
         name = name or spelt(Path(source).stem)
     roles = parse_csv_config(values, source)
     found = {role: _table(one, files, source) for role, one in roles.items()}
@@ -211,8 +212,7 @@ def _measurements(
     roles: Mapping[str, CsvRole], tables: Mapping[str, CsvTable]
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Measurements by role, and notes about what was assumed, left out, and looks wrong."""
-    calibration = Calibration()
-    adapters = {role: one.adapter for role, one in roles.items()}
+    adapters: dict[str, Any] = {role: one.adapter for role, one in roles.items()}
     _, about_origin = common_origin("positions", adapters, tables)
     notes = {"log.origin": about_origin} if about_origin else {}
     blocks: dict[str, Any] = {}
@@ -220,11 +220,11 @@ def _measurements(
     doubts: list[str] = []
     for role, table in tables.items():
         adapter = adapters[role]
-        if assumed := adapter.assumption(calibration.gravity_m_s2):
+        if assumed := adapter.assumption(STANDARD_GRAVITY):
             notes["log.depth"] = assumed
         # axes of the vehicle: a mounting is of the calibration, which tables do not have
         origin, _ = common_origin(role, adapters, tables)
-        rows, dropped = rows_of(adapter, table, calibration, np.eye(3), origin)
+        rows, dropped = adapter.read(table, Setup(origin=origin))
         faults = [f"{count} {fault}" for fault, count in dropped.items()]
         if rows is None:
             raise LogError(

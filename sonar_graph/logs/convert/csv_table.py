@@ -253,7 +253,6 @@ class CsvTable(FieldTable):
     ) -> None:
         """``paths``: columns; ``stamp``: that of the time, None where rows have none."""
         self.file = file
-        self.source = file.path.name
         self._role = role
         wanted = {path: file.index(path, f"[{role}]") for path in paths}
         at = [] if stamp is None else [file.index(stamp, f"[{role}] stamp")]

@@ -12,66 +12,18 @@ Ribas, Ridao, Tardós, Neira, "Underwater SLAM in man-made structured environmen
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sonar_graph.calibration import (
-    Calibration,
-    DvlCalibration,
-    HeadingCalibration,
-    ImuCalibration,
-    Mounting,
-    Start,
-)
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.errors import DatasetError, LogError
 from sonar_graph.logs.convert.csv_log import read_csv
+from sonar_graph.logs.convert.text_tables import DATA_SETS
 from sonar_graph.sequence import Sequence
 
-BODY_YAW_IMU_RAD = -np.pi / 2
-BODY_YAW_DVL_RAD = -np.pi / 3
 FILES = ("MTI.log", "DVL.log", "DGPS.log")
-TABLES: dict[str, Any] = {
-    "stamp": 1,
-    "stamp_unit_s": "s",
-    "comment": "%",
-    "encoding": "latin-1",
-    "imu": {
-        "file": "MTI.log",
-        "angular_velocity": [5, 6, 7],
-        "linear_acceleration": [8, 9, 10],
-        "rotation": "frd",
-    },
-    "heading": {
-        "file": "MTI.log",
-        "yaw": 4,
-        "scale": "deg",
-        "world": "ned",
-        "yaw_offset_rad": -BODY_YAW_IMU_RAD,
-    },
-    "dvl": {
-        "file": "DVL.log",
-        "velocity": [12, 13, 14],
-        "scale": "cm/s",
-        "valid_where": {"15": 1},
-        # the status decides alone, so that spikes and zeros stay
-        "lock": "marked",
-        "are_zeros_measured": True,
-    },
-    "truth": {
-        "file": "DGPS.log",
-        "geodetic": {
-            "latitude": "2",
-            "longitude": "3",
-            "height": "5",
-            "unit": "ddmm.mmmm",
-        },
-    },
-}
-"""Columns of the files, counted from 1, with units and axes."""
 GYRO_Z_BIAS_RAD_S = -0.0116
 """About the body's z (up)."""
-COMPASS = HeadingCalibration(sigma_rad=0.1, bias_sigma_rad=0.1)
 
 
 def read_stpere(dataset_dir: Path) -> Sequence:
@@ -100,7 +52,8 @@ def read_stpere(dataset_dir: Path) -> Sequence:
     if missing := [name for name in FILES if not (dataset_dir / name).exists()]:
         raise DatasetError(f"{dataset_dir}: holds no {', '.join(missing)}; {advice}")
     try:
-        run = read_csv([dataset_dir / name for name in FILES], TABLES, "stpere")
+        tables = [dataset_dir / name for name in FILES]
+        run = read_csv(tables, DATA_SETS["stpere_tables"], "stpere")
     except LogError as error:
         raise DatasetError(str(error)) from error
     if run.heading is None or run.truth is None:
@@ -121,26 +74,15 @@ def read_stpere(dataset_dir: Path) -> Sequence:
     yaws_rad = np.unwrap(run.heading.yaw_rad)
     yaw_rad = np.interp(start_ns, run.heading.stamps_ns, yaws_rad)
     # one row of the compass, with the error that all of its rows share
-    yaw_sigma_rad = float(np.hypot(COMPASS.sigma_rad, COMPASS.bias_sigma_rad))
-    calibration = Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=2e-3,
-            gyro_bias_sigma=1e-3,
-            accel_noise_density=1e-2,
-            accel_bias_sigma=0.1,
-            mounting=Mounting(rpy_rad=(0.0, 0.0, BODY_YAW_IMU_RAD)),
-        ),
-        dvl=DvlCalibration(
-            velocity_sigma_m_s=(0.08, 0.08, 0.08),
-            mounting=Mounting(rpy_rad=(0.0, 0.0, BODY_YAW_DVL_RAD)),
-        ),
-        heading=COMPASS,
-        start=Start(
-            position_m=(x, y, 0.0),
-            rpy_rad=(0.0, 0.0, float(np.angle(np.exp(1j * yaw_rad)))),
-            rpy_sigma_rad=(0.1, 0.1, yaw_sigma_rad),
-        ),
+    known = Calibration.model_validate(DATA_SETS["stpere"])
+    compass = known.heading
+    yaw_sigma_rad = float(np.hypot(compass.sigma_rad, compass.bias_sigma_rad))
+    start = Start(
+        position_m=(x, y, 0.0),
+        rpy_rad=(0.0, 0.0, float(np.angle(np.exp(1j * yaw_rad)))),
+        rpy_sigma_rad=(0.1, 0.1, yaw_sigma_rad),
     )
+    calibration = known.model_copy(update={"start": start})
     notes = {
         "data set": "St. Pere Pescador; Ribas, Ridao, Tardós, Neira, Journal of Field Robotics 25(11-12), 2008",
         "licence": "none stated for the data",

@@ -1,5 +1,7 @@
-"""Tables of numbers in public data sets, and the numbered runs in their folders."""
+"""Public data sets: what is known of them, tables of numbers, and the numbered runs in their folders."""
 
+import tomllib
+from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,6 +10,11 @@ import numpy as np
 from sonar_graph.errors import DatasetError, LogError
 from sonar_graph.logs.convert.csv_table import CsvFile, CsvForm, CsvTable
 from sonar_graph.measurements import Floats, Ints
+
+DATA_SETS = tomllib.loads(
+    files("sonar_graph.logs.convert").joinpath("data_sets.toml").read_text("utf-8")
+)
+"""Calibrations and columns of public data sets."""
 
 
 class NumberTable(NamedTuple):

@@ -33,7 +33,7 @@ from sonar_graph.logs.mcap.record_walk import (
     content_of,
 )
 from sonar_graph.logs.mcap.time_window import WindowLimits
-from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Loss, Topic
+from sonar_graph.logs.mcap.topic import Damage, Descriptions, Keep, Keeping, Loss, Topic
 
 _BLOCK = 1 << 22
 _NS_PER_S = 1_000_000_000
@@ -82,7 +82,7 @@ class Passage:
     def __init__(
         self,
         file: LogFile,
-        keep: Callable[[str], Keep],
+        keep: Keeping,
         limits: WindowLimits | None = None,
         *,
         may_skip: bool = True,

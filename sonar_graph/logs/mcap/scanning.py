@@ -1,6 +1,6 @@
 """Reading of whole logs, a file or several: messages gathered by topic, or given piece by piece."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
 
@@ -9,7 +9,15 @@ from sonar_graph.logs.mcap.bag_folder import log_parts
 from sonar_graph.logs.mcap.log_file import LARGEST_BYTES, LARGEST_RATIO, LogFile
 from sonar_graph.logs.mcap.reader import Passage, Progress, Recording, first_time_ns
 from sonar_graph.logs.mcap.time_window import TimeWindow, WindowLimits
-from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, keeping, settle
+from sonar_graph.logs.mcap.topic import (
+    Damage,
+    Keep,
+    Keeping,
+    Loss,
+    Topic,
+    keeping,
+    settle,
+)
 
 _PIECE_BYTES = 1 << 20
 _NUMBERS_ALONE = keeping([])
@@ -17,7 +25,7 @@ _NUMBERS_ALONE = keeping([])
 
 def scan(
     path: Path,
-    keep: Callable[[str], Keep] = _NUMBERS_ALONE,
+    keep: Keeping = _NUMBERS_ALONE,
     window: TimeWindow | None = None,
     progress: Progress | None = None,
 ) -> Recording:
@@ -53,7 +61,7 @@ def scan(
 
 def _passages(
     path: Path,
-    keep: Callable[[str], Keep],
+    keep: Keeping,
     window: TimeWindow | None,
     progress: Progress | None,
     damage: Damage,
@@ -142,7 +150,7 @@ def _gather_all(passage: Passage, file: LogFile) -> None:
 
 def stream(
     path: Path,
-    keep: Callable[[str], Keep],
+    keep: Keeping,
     window: TimeWindow | None = None,
     *,
     salvage: bool = False,

@@ -44,7 +44,11 @@ class Keep(Enum):
     ALL = -1
 
 
-def keeping(types: Iterable[str], others: Keep = Keep.NONE) -> Callable[[str], Keep]:
+Keeping = Callable[[str], Keep]
+"""Part of a message to keep, by the name of its type."""
+
+
+def keeping(types: Iterable[str], others: Keep = Keep.NONE) -> Keeping:
     """Choice of the whole messages of some types, and of a part of those of others, by the name of the type."""
     wanted = set(map(short_name, types))
     return lambda kind: Keep.ALL if short_name(kind) in wanted else others
@@ -327,7 +331,7 @@ _TRANSIENT_LOCAL = re.compile(r"durability:\s*(1\b|transient_local)")
 class Descriptions:
     """Schemas and channels by their numbers; the first description of a number counts."""
 
-    def __init__(self, path: Path, keep: Callable[[str], Keep]) -> None:
+    def __init__(self, path: Path, keep: Keeping) -> None:
         self._path = path
         self._keep = keep
         self._schemas: dict[int, Schema] = {0: Schema(0, b"", "", "")}

@@ -2,17 +2,20 @@
 
 The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise linear rates and the trapezoid rule::
 
-    C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt,    P(t) = int [C f]x S dt
+    C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt,    P(t) = int [C f]x S dt,
+    L(t) = int C [w]x f dt
 
 Between two Doppler samples k, at their stamps plus the offset, velocity changes as the accelerometers measured::
 
     x_k = C_k (R v_k - w_k x l) - F_k
     x_{k+1} - x_k = -d(C R v) (s - 1) + d(C [R v]x) psi + d(C [w]x) dl - d(S) b + d(P - [C R v]x S) b_g
-                    + gamma T + gamma' T t
+                    + d(L) tau + gamma T + gamma' T t
 
 s scales the log's velocities, psi turns its mounting, dl corrects the lever arm l from IMU to log; b and b_g are the
-biases of accelerometers and gyros. Gravity gamma and its slow turning are fitted again every half minute. Rows of one
-or two beams and rows near holes of the IMU are left out. Derivation and accuracy: docs/theory/sensor_check.md.
+biases of accelerometers and gyros; tau is how much later the filters of the gyros are than those of the accelerometers:
+of a vehicle that rolls and circles, some milliseconds of it look like a pitch of the log by degrees. Gravity gamma and
+its slow turning are fitted again every half minute. Rows of one or two beams and rows near holes of the IMU are left
+out. Derivation and accuracy: docs/theory/sensor_check.md.
 """
 
 from __future__ import annotations
@@ -64,6 +67,8 @@ class InertialPath:
     """S, shape (n, 3, 3), s: derivative of F by the accelerometers' bias."""
     tilted_impulse: Floats
     """P, shape (n, 3, 3), m: minus the derivative of F by the gyros' bias."""
+    delayed_impulse: Floats
+    """L, shape (n, 3), m/s²: derivative of F by a delay of the gyros."""
     rate: Floats
     """Angular rate as measured, shape (n, 3), rad/s."""
     parts: Ints
@@ -132,8 +137,8 @@ def holes_before(stamps_ns: Ints) -> Ints:
 
 def strapdown_integrals(
     seconds: Floats, rate: Floats, force: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Turns between the samples, and C, F, S and P of the module's equations at every sample."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Turns between the samples, and C, F, S, P and L of the module's equations at every sample."""
     mean_rate = 0.5 * (rate[:-1] + rate[1:])
     turns = mean_rate * np.diff(seconds)[:, None]  # (n - 1, 3)
     from scipy.integrate import cumulative_trapezoid  # takes most of a second to load
@@ -144,7 +149,9 @@ def strapdown_integrals(
     F = integral(felt[:, :, 0])
     S = integral(C)
     P = integral(np.cross(felt, S, axis=1))
-    return turns, C, F, S, P
+    turned = C @ np.cross(rate, force)[:, :, None]
+    L = integral(turned[:, :, 0])
+    return turns, C, F, S, P, L
 
 
 STRETCH_S = 30.0
@@ -155,8 +162,10 @@ LEAST_ROWS = 12
 LARGEST_INTERVAL = 3.0
 """In usual intervals: a longer time between two samples ends a stretch."""
 LEAST_STRETCHES = 2
-PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] * 3])
-"""Scale; turn, rad, about x and y near the calibration's; lever arm, m; biases, m/s² and rad/s."""
+PRIOR_SIGMAS = np.array(
+    [1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] * 3, 0.005]
+)
+"""Scale; turn, rad, about x and y near the calibration's; lever arm, m; biases, m/s² and rad/s; delay of the gyros, s."""
 # places among the parameters, after the offset
 SCALE = 1
 TURN = slice(2, 5)
@@ -182,7 +191,7 @@ ACCEL_BIAS_LIMIT_M_S2 = 0.05
 GYRO_BIAS_LIMIT_RAD_S = 5e-3
 NO_MANOEUVRES = "too little acceleration"
 NO_TURNS = "too little turning"
-Estimates3D = tuple[Estimate1D, Estimate1D, Estimate1D]
+Estimates3D = tuple[Estimate1D, ...]
 """Along x, y and z of the body."""
 
 
@@ -376,6 +385,7 @@ def velocity_changes(
     F = path.linear_at(seconds, path.impulse)  # (n, 3)
     S = path.linear_at(seconds, path.turned_time)  # (n, 3, 3)
     P = path.linear_at(seconds, path.tilted_impulse)  # (n, 3, 3)
+    L = path.linear_at(seconds, path.delayed_impulse)  # (n, 3)
     turning = C @ cross_matrices(path.linear_at(seconds, path.rate))  # C [w]x
     by_lever = turning @ lever
     x = (C @ velocity[:, :, None])[:, :, 0] - by_lever - F
@@ -394,13 +404,14 @@ def velocity_changes(
             - cross_matrices(F_since) @ S[r][0]
             - cross_matrices(carried) @ S_since
         )
-        # by scale, mounting, lever arm, both biases: (n, 3, 13)
+        # by scale, mounting, lever arm, both biases, delay: (n, 3, 14)
         columns = [
             -carried[:, :, None],
             C[r] @ cross_matrices(in_body),
             turning[r],
             -S_since,
             drifting,
+            L[r][:, :, None],
         ]
         # the signs of the axes do not matter
         axes, _ = np.linalg.qr(F_since[-1:].T, "complete")

@@ -1,8 +1,8 @@
 """Figures of a comparison, and how its page and a paper show them."""
 
 # fmt: off
-from sonar_graph.report.figures.detection_figures import innovation_figure
-from sonar_graph.report.figures.error_figures import bounds_figure, error_figure, nees_figure, yaw_figure
+from sonar_graph.report.figures.error_figures import (bounds_figure, error_figure, innovation_figure, nees_figure,
+    yaw_figure)
 from sonar_graph.report.figures.illustrations import RAW_VIEW, drawings, illustrations, panels_of
 from sonar_graph.report.figures.maps import growth_figure, map_figure
 

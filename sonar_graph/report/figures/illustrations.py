@@ -24,7 +24,7 @@ from sonar_graph.report.figure_style import (
     inline_svg,
     sized,
 )
-from sonar_graph.report.figures import detection_figures, error_figures
+from sonar_graph.report.figures import error_figures
 from sonar_graph.report.figures.maps import (
     enlargement,
     growth_figure,
@@ -42,7 +42,8 @@ class Drawing:
 
     title: str
     draw: Callable[[Comparison], Figure | None]
-    caption: str = ""
+    caption: str
+    """With the names of `_words` in braces, as the sentence below."""
     instead: str = "No run has a path to draw."
     """Sentence where there is nothing to draw."""
     columns: int = 2
@@ -53,18 +54,26 @@ class Drawing:
 
 # in reading order
 DRAWINGS = {
-    "map": Drawing("Map", map_figure, columns=1, is_aligned_too=True),
+    "map": Drawing(
+        "Map",
+        map_figure,
+        "Paths{and_landmarks}, {world}.{ellipses}{paths_cut} {located}",
+        columns=1,
+        is_aligned_too=True,
+    ),
     "growth": Drawing(
         "Map as it grew",
         growth_figure,
-        instead="No run kept its map on the way.",
+        "Causal paths until the time T since start, and landmarks as known then, {world}. Ellipses hold 95 %{as_large}."
+        "{fig_4}",
+        "No run kept its map on the way.",
         is_aligned_too=True,
     ),
     "errors": Drawing(
         "Error over time and distance",
         error_figures.error_figure,
         "Horizontal distance of the causal position from the truth{and_heading}, {world}. "
-        "Left: over time. Right: over the distance travelled.{cut}",
+        "Left: over time. Right: over the distance travelled.{errors_cut}",
         "{no_errors}",
         is_aligned_too=True,
     ),
@@ -78,6 +87,7 @@ DRAWINGS = {
     "yaw": Drawing(
         "Yaw over time",
         error_figures.yaw_figure,
+        "Heading of the body's x axis, wrapped to ±180°, causal.{fig_5}",
         columns=1,
     ),
     "nees": Drawing(
@@ -90,7 +100,7 @@ DRAWINGS = {
     ),
     "innovations": Drawing(
         "Innovations over time",
-        detection_figures.innovation_figure,
+        error_figures.innovation_figure,
         "Measured minus predicted range and azimuth. Long runs show an even choice, with the extremes.",
         "No run reports innovations.",
     ),
@@ -117,8 +127,9 @@ def drawings(comparison: Comparison) -> dict[str, tuple[Comparison, Drawing]]:
         if aligned is not None and drawing.is_aligned_too:
             views = {name: aligned, name + RAW_VIEW: comparison}
         for view, shown in views.items():
-            caption = _captions(shown).get(name, drawing.caption)
-            instead = _instead(shown, drawing)
+            words = _words(shown)
+            caption = drawing.caption.format(**words).rstrip()
+            instead = drawing.instead.format(**words)
             found[view] = (shown, replace(drawing, caption=caption, instead=instead))
     return found
 
@@ -138,7 +149,8 @@ def panels_of(comparison: Comparison, name: str, *, aligned: bool) -> list[Axes]
         raise EvaluationError("aligned=True: no run has errors against a truth")
     figure = DRAWINGS[name].draw(shown)
     if figure is None:
-        raise EvaluationError(f"nothing to draw. {_instead(shown, DRAWINGS[name])}")
+        instead = DRAWINGS[name].instead.format(**_words(shown))
+        raise EvaluationError(f"nothing to draw. {instead}")
     arrange(figure)
     return figure.axes
 
@@ -161,58 +173,48 @@ def _illustration(comparison: Comparison, name: str, drawing: Drawing) -> Illust
     return Illustration(name, drawing.title, drawing.caption, svg, drawing.instead)
 
 
-def _instead(comparison: Comparison, drawing: Drawing) -> str:
+def _words(comparison: Comparison) -> dict[str, str]:
+    """What captions, and sentences in their place, have of a comparison."""
     no_errors = "No run has errors against the ground truth."
     if comparison.sequence.truth is None:
         no_errors = "The log has no ground truth, so there are no errors to draw."
-    return drawing.instead.format(no_errors=no_errors)
-
-
-def _captions(comparison: Comparison) -> dict[str, str]:
-    """Captions that depend on the comparison."""
-    # only the repeated experiment may name the paper's figures
-    is_repeated = repeats_published(comparison.sequence)
-    world = ALIGNED if comparison.is_aligned else unaligned(comparison.sequence)
-    counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
+    is_aligned = comparison.is_aligned
     factor = enlargement(comparison)
     as_large = "" if factor == 1 else f", drawn {factor} times as large"
-    growth = (
-        f"Causal paths until the time T since start, and landmarks as known then, {world}. "
-        f"Ellipses hold 95 %{as_large}."
-        f"{counterpart.format('Fig. 4')}"
-    )
-    if is_repeated:
+    has_map = comparison.sequence.true_landmarks is not None or bool(comparison.maps)
+    located = ""
+    if not is_aligned:
+        located = located_line(comparison).replace("map:", "map (star):", 1)
+        if landmarks_moved(comparison):
+            located += " Thick lines lead from the given places of landmarks to those where they are mapped again."
+    words = {
+        "world": ALIGNED if is_aligned else unaligned(comparison.sequence),
+        "no_errors": no_errors,
+        "as_large": as_large,
+        "and_landmarks": " and landmarks" * has_map,
+        "ellipses": f" Ellipses hold 95 %{as_large}." * has_map,
+        "located": located,
+        "and_heading": ", and size of the causal heading's error"
+        * error_figures.has_yaw(comparison),
+        "paths_cut": _leaving(paths_cut_off(comparison)),
+        "errors_cut": _leaving(error_figures.errors_cut_off(comparison)),
+        "in_band": error_figures.shares_in_band(comparison),
+        "fig_4": "",
+        "fig_5": "",
+    }
+    # only the repeated experiment may name the paper's figures
+    if repeats_published(comparison.sequence):
+        counterpart = " The counterpart of {} of the 2014 paper."
         *others, last = (f"{time_s:.1f}" for time_s in MAP_TIMES_S)
         times = f"{', '.join(others)} and {last} s"
-        if abs(comparison.sequence.duration_s - DURATION_S) < 1:
-            growth += f" T are the instants nearest to its {times}."
-        else:
-            growth += f" T are the same fractions of this run as its {times} of {DURATION_S:.1f} s."
-    has_map = comparison.sequence.true_landmarks is not None or any(
-        run.landmarks for run in comparison.runs
-    )
-    landmarks = f" Ellipses hold 95 %{as_large}."
-    line = "" if comparison.is_aligned else located_line(comparison)
-    located = line.replace("map:", "map (star):", 1)
-    if not comparison.is_aligned and landmarks_moved(comparison):
-        located += " Thick lines lead from the given places of landmarks to those where they are mapped again."
-    gone = paths_cut_off(comparison)
-    has_yaw = error_figures.has_yaw(comparison)
-    in_words = {
-        "world": world,
-        "and_heading": ", and size of the causal heading's error" * has_yaw,
-        "cut": _leaving(error_figures.errors_cut_off(comparison)),
-        "in_band": error_figures.shares_in_band(comparison),
-    }
-    captions = {
-        name: DRAWINGS[name].caption.format(**in_words)
-        for name in ("errors", "bounds", "nees")
-    }
-    return captions | {
-        "map": f"Paths{' and landmarks' * has_map}, {world}.{landmarks * has_map}{_leaving(gone)} {located}".rstrip(),
-        "growth": growth,
-        "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
-    }
+        of_paper = f"the instants nearest to its {times}."
+        if abs(comparison.sequence.duration_s - DURATION_S) >= 1:
+            of_paper = (
+                f"the same fractions of this run as its {times} of {DURATION_S:.1f} s."
+            )
+        words["fig_4"] = f"{counterpart.format('Fig. 4')} T are {of_paper}"
+        words["fig_5"] = counterpart.format("Fig. 5")
+    return words
 
 
 def _leaving(names: list[str]) -> str:

@@ -48,8 +48,9 @@ def map_figure(comparison: Comparison) -> Figure | None:
         return None
     # one factor for all landmarks, so that ellipses can be compared
     factor = enlargement(comparison)
-    view = view if factor == 1 else with_room(view)
-    figure, axes = style.blank_panels(1, 1, (style.width_in(), style.width_in()))
+    if factor > 1:
+        view = widened(view, LARGEST_ELLIPSE * size_of(view))
+    figure, axes = style.blank_panels(1, 1, (style.width_in(),) * 2)
     panel: Axes = axes[0, 0]
     look: dict[str, Any] = {"color": style.INK, "markersize": 9, "markeredgewidth": 1.4}
     draw_path(
@@ -105,15 +106,15 @@ def landscape(view: Floats) -> Floats:
     """The view, widened until its height is at most `HIGHEST` of its width, so that a map fits a screen."""
     width, height = view[1] - view[0]
     missing = max(height / HIGHEST - width, 0.0)
-    return np.asarray(view + np.array([[-missing / 2, 0.0], [missing / 2, 0.0]]))
+    return view + np.array([[-missing / 2, 0.0], [missing / 2, 0.0]])
 
 
 def true_landmarks_drawn(comparison: Comparison) -> LandmarkMap | None:
     """The true landmarks in the world of the start pose; landmarks of another world are aligned to the first map."""
     true = comparison.sequence.true_landmarks
     # the first map decides, so that all are drawn in one world
-    maps = [run.landmarks for run in comparison.runs if run.landmarks]
-    scored = scored_map(maps[0], comparison.sequence) if maps else None
+    first = next(iter(comparison.maps), None)
+    scored = scored_map(first, comparison.sequence) if first else None
     if true is None or scored is None or scored.alignment is None:
         return true
     return scored.alignment.inverse().map(true)
@@ -150,11 +151,10 @@ def _paths(run: RunResult) -> list[Floats]:
 def map_view(comparison: Comparison) -> Floats | None:
     """Lower left and upper right corner of the map, shape (2, 2), metres; None where there is no path."""
     estimates = [path for run in comparison.runs for path in _paths(run)]
-    sequence = comparison.sequence
-    references = [path.positions[:, :2] for path in (sequence.truth,) if path]
+    truth = comparison.sequence.truth
+    references = [truth.positions[:, :2]] if truth else []
     if not references and not estimates:
         return None
-    maps = [run.landmarks for run in comparison.runs if run.landmarks]
     if true := true_landmarks_drawn(comparison):
         references.append(true.positions[:, :2])
 
@@ -165,7 +165,7 @@ def map_view(comparison: Comparison) -> Floats | None:
     anchor = box(np.vstack(references or estimates))
     largest = max(size_of(anchor), 1.0)
     limits = widened(anchor, MARGIN * largest)
-    places = [landmarks.positions[:, :2] for landmarks in maps]
+    places = [landmarks.positions[:, :2] for landmarks in comparison.maps]
     everything = np.vstack([anchor, *estimates, *places])
     shown = box(np.clip(everything[np.isfinite(everything).all(axis=1)], *limits))
     return widened(shown, 0.04 * largest)
@@ -179,11 +179,6 @@ def size_of(view: Floats) -> float:
 def widened(view: Floats, margin_m: float) -> Floats:
     """The view with a margin on all sides."""
     return view + np.array([[-1.0], [1.0]]) * margin_m
-
-
-def with_room(view: Floats) -> Floats:
-    """The view, widened by what the largest ellipse may need."""
-    return widened(view, LARGEST_ELLIPSE * size_of(view))
 
 
 def draw_ellipses(
@@ -206,11 +201,10 @@ def draw_ellipses(
 def label_landmarks(panel: Axes, comparison: Comparison) -> None:
     """Write names beside landmarks in view: true ones, and of the first map those without an identity, or all."""
     true = true_landmarks_drawn(comparison)
-    maps = [run.landmarks for run in comparison.runs if run.landmarks]
     shown = [] if true is None else [(true.ids, true.positions)]
-    if maps:
-        is_shown = maps[0].ids >= (0 if true is None else FIRST_ANONYMOUS_ID)
-        shown.append((maps[0].ids[is_shown], maps[0].positions[is_shown]))
+    for first in comparison.maps[:1]:
+        is_shown = first.ids >= (0 if true is None else FIRST_ANONYMOUS_ID)
+        shown.append((first.ids[is_shown], first.positions[is_shown]))
     if not shown:
         return
     ids, points = map(np.concatenate, zip(*shown, strict=True))
@@ -228,20 +222,14 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     runs = _runs_with_maps(comparison)
     if view is None or not runs:
         return None
-    view = with_room(view)
+    view = widened(view, LARGEST_ELLIPSE * size_of(view))
     stamps_ns = grown_at(comparison)
     enlarged = enlargement(comparison)
-    size = style.width_in(), style.width_in()
     figure, axes = style.blank_panels(
-        len(runs), len(stamps_ns), size, sharex=True, sharey=True
+        len(runs), len(stamps_ns), (style.width_in(),) * 2, sharex=True, sharey=True
     )
     true = true_landmarks_drawn(comparison)
     truth = comparison.sequence.truth
-    marks: dict[str, Any] = {
-        "markersize": 7,
-        "markeredgewidth": 1.2,
-        "color": style.INK,
-    }
     for panels, (index, run) in zip(axes, runs.items(), strict=True):
         own = style.colour(index)
         panels[0].set_ylabel(f"{run.estimator}\nworld y (m)")
@@ -253,7 +241,8 @@ def growth_figure(comparison: Comparison) -> Figure | None:
             look = {"color": own, "linewidth": 1.0}
             draw_path(panel, run.causal, stamp_ns, label="causal estimate", **look)
             if true is not None:
-                draw_points(panel, true, "+", label="true landmarks", **marks)
+                look = {"markersize": 7, "markeredgewidth": 1.2, "color": style.INK}
+                draw_points(panel, true, "+", label="true landmarks", **look)
             if stamp_ns in known_at:
                 known = known_at[stamp_ns]
                 look = {"color": own, "markersize": 2.5}
@@ -305,5 +294,5 @@ def _runs_with_maps(comparison: Comparison) -> dict[int, RunResult]:
     return {
         index: run
         for index, run in enumerate(comparison.runs)
-        if any(len(known.landmarks) for known in run.maps)
+        if any(known.landmarks for known in run.maps)
     }

@@ -298,17 +298,16 @@ def sum_echoes(
 
 
 @compiled
-def through_beams(
-    beam_matrix: Floats32, bands: Ints, echoes: Floats32, seen: Floats32
-) -> None:
-    """Matrix product ``seen += beam_matrix @ echoes``, on one core and always in the same order.
+def through_beams(beam_matrix: Floats32, bands: Ints, echoes: Floats32) -> Floats32:
+    """Matrix product ``beam_matrix @ echoes``, on one core and always in the same order.
 
-    Shapes (beams, columns), (columns, samples), (beams, samples). Of each beam only the columns of its band count, from
-    the first to the last (not included), whose number is divisible by 4. A BLAS would use all cores for a product this
-    small, and its bytes would depend on their number.
+    Shapes (beams, columns), (columns, samples), gives (beams, samples). Of each beam only the columns of its band count,
+    from the first to the last (not included), whose number is divisible by 4. A BLAS would use all cores for a product
+    this small, and its bytes would depend on their number.
     """
     samples = echoes.shape[1]
-    for beam in range(beam_matrix.shape[0]):
+    seen = np.zeros((len(beam_matrix), samples), np.float32)
+    for beam in range(len(beam_matrix)):
         for column in range(bands[beam, 0], bands[beam, 1], 4):
             a = beam_matrix[beam, column]
             b = beam_matrix[beam, column + 1]
@@ -318,6 +317,7 @@ def through_beams(
                 seen[beam, k] += (a * echoes[column, k] + b * echoes[column + 1, k]) + (
                     c * echoes[column + 2, k] + d * echoes[column + 3, k]
                 )
+    return seen
 
 
 NONE = np.empty((0, 0), np.float32)

@@ -180,10 +180,9 @@ class FrameSimulator:
         position_m = np.asarray(position_m, float)
         total = self.scattered(position_m, world_R_sonar, number)
         columns, bins, _ = total.shape
-        seen = np.zeros((self.sonar.beams, bins * 2), np.float32)
         # real and imaginary parts are samples alike: the pattern of a beam is real
         by_column = np.ascontiguousarray(total).reshape(columns, -1)
-        echoes.through_beams(self._beam_matrix, self._bands, by_column, seen)
+        seen = echoes.through_beams(self._beam_matrix, self._bands, by_column)
         if self.options.cross_talk_db is not None:
             seen = with_cross_talk(seen, self.sonar, self.options.cross_talk_db)
         signal = seen.reshape(-1, bins, 2) * self._spreading[:, None]

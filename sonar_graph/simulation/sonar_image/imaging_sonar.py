@@ -5,12 +5,12 @@ width of a beam at half power, ``D = 0.886 wavelength / width``: its first side 
 values: docs/theory/sonar_image.md.
 """
 
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sonar_image.conditions import SceneConditions
 
@@ -19,28 +19,29 @@ SOUND_SPEED_M_S = 1480.0
 _FINE_DEG = np.linspace(-20, 20, 8001)
 
 
-class ImagingSonar(Section):
+@dataclass(frozen=True)
+class ImagingSonar:
     """Parameters of a multibeam imaging sonar."""
 
-    frequency_hz: float = Field(gt=0)
-    beams: int = Field(gt=1)
-    azimuth_span_rad: float = Field(gt=0, lt=np.pi)
+    frequency_hz: float
+    beams: int
+    azimuth_span_rad: float
     """Of all beams together, where the lens is linear."""
-    beam_width_rad: float = Field(gt=0)
+    beam_width_rad: float
     """Of one beam, one way, between half powers."""
-    elevation_span_rad: float = Field(gt=0, lt=np.pi)
+    elevation_span_rad: float
     """One way, between half powers."""
-    bins: int = Field(gt=1)
-    range_start_m: float = Field(gt=0)
-    range_length_m: float = Field(gt=0)
-    range_resolution_m: float = Field(gt=0)
+    bins: int
+    range_start_m: float
+    range_length_m: float
+    range_resolution_m: float
     """Length of a pulse in range, between half powers."""
-    firing_groups: int = Field(1, ge=1)
+    firing_groups: int = 1
     """Beams whose numbers are equal modulo this are fired together."""
     lens_cubic: tuple[float, float, float, float] | None = None
     """Beam number, from 1 at the left, as a cubic of degrees to the right, lowest order last; None: beams are equally
     spaced."""
-    decibel_span: float = Field(80.0, gt=0)
+    decibel_span: float = 80.0
     """Decibels over the 255 counts of a sample."""
 
     @property
@@ -112,7 +113,7 @@ edge. Length of the pulse: ours."""
 
 def same_window(**changes: Any) -> ImagingSonar:
     """A sonar over the window of the DIDSON, with beams equally spaced."""
-    return DIDSON.model_copy(update={"lens_cubic": None, **changes})
+    return replace(DIDSON, lens_cubic=None, **changes)
 
 
 ARIS_3000 = same_window(
@@ -193,6 +194,4 @@ class ImageOptions(SceneConditions):
         length_m = self.window_m or sonar.range_length_m
         # real sonars lengthen their pulse with the window
         resolution_m = sonar.range_resolution_m * length_m / sonar.range_length_m
-        return sonar.model_copy(
-            update={"range_length_m": length_m, "range_resolution_m": resolution_m}
-        )
+        return replace(sonar, range_length_m=length_m, range_resolution_m=resolution_m)

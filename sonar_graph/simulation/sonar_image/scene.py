@@ -239,29 +239,49 @@ def stone(radius_m: float, height_m: float, level_db: float) -> Shape:
     return shape
 
 
+def material(
+    inside: NDArray[np.bool_], level_db: Floats | float, height_m: Floats | float
+) -> tuple[Floats, Floats]:
+    """Level and height of what lies inside of an outline; floor around it."""
+    return np.where(inside, level_db, np.nan), np.where(inside, height_m, 0.0)
+
+
+def ragged_outline(
+    radius_m: float,
+    limits: tuple[float, float],
+    harmonics: int,
+    sigma: float,
+    rng: np.random.Generator,
+) -> Callable[[Floats, Floats], Floats]:
+    """Draw an outline: its radius at points, which varies irregularly with direction, within limits over the mean."""
+    # higher harmonics are weaker: a rough outline without spikes
+    order = np.arange(1, harmonics + 1)
+    waves = rng.normal(0, sigma / np.sqrt(order), (2, harmonics))
+
+    def outline(x_m: Floats, y_m: Floats) -> Floats:
+        angle = np.arctan2(y_m, x_m)[..., None] * order
+        share = 1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1]
+        return radius_m * np.clip(share, *limits)
+
+    return outline
+
+
 def block(length_m: float, width_m: float, height_m: float, level_db: float) -> Shape:
     """A box; its upright sides scatter as steeply as the grid can show."""
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         inside = (np.abs(x_m) < length_m / 2) & (np.abs(y_m) < width_m / 2)
-        return np.where(inside, level_db, np.nan), np.where(inside, height_m, 0.0)
+        return material(inside, level_db, height_m)
 
     return shape
 
 
 def ragged_patch(radius_m: float, level_db: float, rng: np.random.Generator) -> Shape:
     """A flat rough patch whose radius varies irregularly with direction, from about half to one and a half."""
-    # higher harmonics are weaker: a rough outline without spikes
-    order = np.arange(1, 6)
-    waves = rng.normal(0, 0.28 / np.sqrt(order), (2, len(order)))
+    outline = ragged_outline(radius_m, (0.3, 1.7), 5, 0.28, rng)
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-        angle = np.arctan2(y_m, x_m)[..., None] * order
-        outline = radius_m * np.clip(
-            1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.3, 1.7
-        )
-        inside = np.hypot(x_m, y_m) < outline
-        return np.where(inside, level_db, np.nan), np.where(inside, 0.005, 0.0)
+        return material(np.hypot(x_m, y_m) < outline(x_m, y_m), level_db, 0.005)
 
     return shape
 

@@ -13,7 +13,9 @@ from sonar_graph.simulation.sonar_image.scene import (
     SeabedObject,
     Shape,
     block,
+    material,
     place,
+    ragged_outline,
     stone,
 )
 
@@ -39,49 +41,43 @@ def polygon(radius_m: float, corners: int, height_m: float, level_db: float) -> 
         # angle from the middle of the nearest side
         from_side = np.arctan2(y_m, x_m) % step - step / 2
         inside = np.hypot(x_m, y_m) * np.cos(from_side) < apothem_m
-        return np.where(inside, level_db, np.nan), np.where(inside, height_m, 0.0)
+        return material(inside, level_db, height_m)
 
     return shape
 
 
-def rimmed_disc(
-    radius_m: float, rim_m: float, rim_height_m: float, dome_m: float, knob_m: float
-) -> Shape:
+def _pan_lid(rng: np.random.Generator) -> Drawn:
     """A round lid: 2 dB under the floor where it is smooth, 9 dB over it on rim and knob; it rises to a dome."""
+    radius_m = rng.uniform(0.11, 0.15)
+    dome_m = rng.uniform(0.015, 0.03)
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         away = np.hypot(x_m, y_m)
-        is_rough = ((away > radius_m - rim_m) & (away < radius_m)) | (away < knob_m)
+        is_knob = away < 0.02
+        is_rough = ((away > radius_m - 0.012) & (away < radius_m)) | is_knob
         top = (
-            rim_height_m
+            0.01
             + dome_m * np.clip(1 - (away / radius_m) ** 2, 0, 1)
-            + np.where(away < knob_m, 0.02, 0.0)
+            + np.where(is_knob, 0.02, 0.0)
         )
-        level_db = np.where(is_rough, 9.0, -2.0)
-        return np.where(away < radius_m, level_db, np.nan), np.where(
-            away < radius_m, top, 0.0
-        )
+        return material(away < radius_m, np.where(is_rough, 9.0, -2.0), top)
 
-    return shape
+    return shape, radius_m
 
 
-def boulder(
-    radius_m: float, height_m: float, level_db: float, rng: np.random.Generator
-) -> Shape:
+def _boulder(rng: np.random.Generator) -> Drawn:
     """A stone of random outline and lumpy top: half an ellipsoid whose radius varies with direction."""
-    order = np.arange(1, 5)
-    waves = rng.normal(0, 0.16 / np.sqrt(order), (2, len(order)))
+    radius_m = rng.uniform(0.08, 0.17)
+    height_m = rng.uniform(0.03, 0.09)
+    level_db = rng.uniform(4, 11)
+    outline = ragged_outline(radius_m, (0.5, 1.4), 4, 0.16, rng)
     # stones are longer than wide, and not smooth on top
     flattened = rng.uniform(0.6, 1.0)
     lumps = rng.uniform(0, 2 * np.pi, 2)
     lump_m = 0.5 * radius_m
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-        angle = np.arctan2(y_m, x_m)[..., None] * order
-        outline = radius_m * np.clip(
-            1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.5, 1.4
-        )
-        from_top = (np.hypot(x_m, y_m / flattened) / outline) ** 2
+        from_top = (np.hypot(x_m, y_m / flattened) / outline(x_m, y_m)) ** 2
         lumpy = 1 + 0.2 * np.sin(x_m / lump_m * np.pi + lumps[0]) * np.sin(
             y_m / lump_m * np.pi + lumps[1]
         )
@@ -89,17 +85,15 @@ def boulder(
             np.clip(1 - from_top, 0, None)
         )
 
-    return shape
+    return shape, 1.4 * radius_m
 
 
-def tuft(
-    radius_m: float,
-    height_m: float,
-    level_db: float,
-    fronds: int,
-    rng: np.random.Generator,
-) -> Shape:
+def _tuft(rng: np.random.Generator) -> Drawn:
     """Weed: narrow fronds from one root, which lie over the floor and between which it shows."""
+    radius_m = rng.uniform(0.12, 0.2)
+    height_m = rng.uniform(0.03, 0.08)
+    level_db = rng.uniform(4, 9)
+    fronds = int(rng.integers(10, 24))
     # each frond is a parabola from the root
     angle = rng.uniform(-np.pi, np.pi, fronds)
     length_m = radius_m * rng.uniform(0.4, 1.0, fronds)
@@ -128,25 +122,7 @@ def tuft(
             )
         return level, top
 
-    return shape
-
-
-def _tuft(rng: np.random.Generator) -> Drawn:
-    radius_m = rng.uniform(0.12, 0.2)
-    shape = tuft(
-        radius_m,
-        rng.uniform(0.03, 0.08),
-        rng.uniform(4, 9),
-        int(rng.integers(10, 24)),
-        rng,
-    )
     return shape, 1.2 * radius_m
-
-
-def _boulder(rng: np.random.Generator) -> Drawn:
-    radius_m = rng.uniform(0.08, 0.17)
-    height_m = rng.uniform(0.03, 0.09)
-    return boulder(radius_m, height_m, rng.uniform(4, 11), rng), 1.4 * radius_m
 
 
 def _stick(rng: np.random.Generator) -> Drawn:
@@ -170,11 +146,6 @@ def _hexagon(rng: np.random.Generator) -> Drawn:
     return polygon(radius_m, 6, 0.013, rng.uniform(8, 12)), radius_m
 
 
-def _pan_lid(rng: np.random.Generator) -> Drawn:
-    radius_m = rng.uniform(0.11, 0.15)
-    return rimmed_disc(radius_m, 0.012, 0.01, rng.uniform(0.015, 0.03), 0.02), radius_m
-
-
 def _box(rng: np.random.Generator) -> Drawn:
     side_m = rng.uniform(0.2, 0.28)
     return block(side_m, side_m, 0.05, rng.uniform(4, 10)), side_m / np.sqrt(2)
@@ -186,15 +157,15 @@ def _round_stone(rng: np.random.Generator) -> Drawn:
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
-    **{
-        "stone": _boulder,
-        "weed": _tuft,
-        "stick": _stick,
-        "lid": _lid,
-        "tile": _tile,
-        "hexagon": _hexagon,
-    },
-    **{"pan-lid": _pan_lid, "box": _box, "round-stone": _round_stone},
+    "stone": _boulder,
+    "weed": _tuft,
+    "stick": _stick,
+    "lid": _lid,
+    "tile": _tile,
+    "hexagon": _hexagon,
+    "pan-lid": _pan_lid,
+    "box": _box,
+    "round-stone": _round_stone,
 }
 """How each kind is drawn. lid: a flat rough disc; tile: a square one; box: 5 cm high; pan-lid: a dome with rim and
 knob; round-stone: half an ellipsoid, stone: one of random outline."""

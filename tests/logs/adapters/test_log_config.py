@@ -10,7 +10,6 @@ from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters import read_log_config
 from sonar_graph.logs.adapters.log_config import toml_value
 
-DVL = '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\n'
 # fmt: off
 MISTAKES: dict[str, tuple[str | None, str]] = {
     "no such role": ("[sonra]\n", r"there is no role \[sonra\]; tables are for imu, dvl, depth"),

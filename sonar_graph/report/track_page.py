@@ -1,12 +1,14 @@
 """Page of ``recognise --report``: each track with its picture, its probabilities and the reasons of its fate."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sonar_graph.recognition import SEE_TRACKS, Recognition, TrackStories, TrackStory
+from sonar_graph.measurements import Floats
+from sonar_graph.recognition import SEE_TRACKS, Recognition, TrackStories
 from sonar_graph.report.rendering import PageSection, write_html
 from sonar_graph.sonar import REPORTED
 from sonar_graph.states import counted
@@ -43,7 +45,8 @@ def write_track_page(
         "extent": f"{counted(recognition.frames, 'frame')}, {tracks}",
         "names": [tracks],
         "recognition": recognition,
-        "tracks": [_row(story, [*identities, NONE], start_ns) for story in shown],
+        "tracks": shown,
+        "likely": partial(likely, [*identities, NONE]),
         "left_out": len(stories.tracks) - len(shown),
         "rejected": sorted(stories.rejected.items(), key=lambda item: -item[1].count),
         "start_ns": start_ns,
@@ -52,19 +55,7 @@ def write_track_page(
     write_html(path, "recognition", SECTIONS, content)
 
 
-def _row(story: TrackStory, names: Sequence[str], start_ns: int) -> dict[str, Any]:
-    """Values of one track, by the names that the template uses."""
-    order = np.argsort(-story.beliefs).tolist()
-    return {
-        "number": story.number,
-        "jpeg": story.jpeg,
-        "from_s": (story.first_ns - start_ns) * 1e-9,
-        "to_s": (story.last_ns - start_ns) * 1e-9,
-        "frames": counted(story.frames, "frame"),
-        "beliefs": [
-            (names[k], float(story.beliefs[k]))
-            for k in order
-            if story.beliefs[k] >= LEAST_SHOWN
-        ],
-        "outcomes": story.outcomes.most_common(),
-    }
+def likely(names: Sequence[str], beliefs: Floats) -> list[tuple[str, float]]:
+    """Names and probabilities of what a track may be, most probable first."""
+    order = np.argsort(-beliefs).tolist()
+    return [(names[k], beliefs[k]) for k in order if beliefs[k] >= LEAST_SHOWN]
