@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
-from baselines.kalman import GATED, USED, far_covariance, is_far, judged
+from baselines.kalman import GATED, USED, is_far, judged
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.models import (
     FLOOR_GATE,
