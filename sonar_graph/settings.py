@@ -246,7 +246,9 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
     fields = list(owner.section.model_fields)
     # the same name in a section below is what was probably meant
     # a line that was pasted below a table counts in that table
-    if len(place) > 1 and name in model.model_fields:
+    if len(place) > 1 and _is_section(model, name):
+        if place[0] == name:
+            return f"{fault}; below [{name}] leave `{name}.` out"
         return f"{fault}; a line `{name}. … = …` goes above the first table of the file, or into the table [{name}]"
     inside = [setting.name for setting in settings_of(owner.section)]
     meant = [
@@ -256,6 +258,12 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
     ]
     hint = f"; did you mean {meant[0]}?" if meant else suggestion(name, fields)
     return f"{fault}{hint} {whose} has: {', '.join(fields) or 'none'}"
+
+
+def _is_section(model: type[BaseModel], name: str) -> bool:
+    """True of a field of the model that has fields of its own."""
+    field = model.model_fields.get(name)
+    return field is not None and any(True for _ in _sections(field.annotation))
 
 
 def choice(name: str, known: Iterable[str], owner: str = "") -> str:

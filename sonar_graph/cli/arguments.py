@@ -110,9 +110,11 @@ class ReadingOptions:
     calibration: Path | None = existing_file(
         "TOML or JSON file, or a log, whose fields go before those of the log's own calibration and mountings."
     )
-    map: Path | None = existing_file(
+    map: Path | None = option(
         "Map of known landmarks: a map.toml that a run has written, or a CSV table of a survey. A start that the log "
-        "does not state is found in it."
+        "does not state is found in it.",
+        metavar="FILE",
+        exists=True,
     )
     topics: list[str] | None = option(
         "Topic for a role, where inspect says that several fit or none; may be repeated. "

@@ -36,7 +36,7 @@ from sonar_graph.diagnosis.signals import (
 from sonar_graph.diagnosis.start import lacks_gravity, turned_mounting, without_bias
 from sonar_graph.diagnosis.turn_rate import residual
 from sonar_graph.errors import AlignmentError
-from sonar_graph.measurements import NS_PER_S, Floats, Imu
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     Estimate1D,
     align_in_motion,
@@ -448,12 +448,21 @@ def misfit_of(sequence: Sequence, begin_ns: int, step_ns: int) -> float:
     if imu is None or dvl is None:
         return 0.0
     whole = until_hole(imu)
-    # a calibration states the noise of a sensor at rest, and thrusters shake it
+    found = misfit_with(whole, dvl, calibration)
+    # a calibration states the noise of a sensor at rest, and thrusters shake it: what that noise explains is no misfit
     sensors = calibration.imu
     shaken = max(sensors.accel_noise_density, vibration_density(whole))
     sensors = sensors.model_copy(update={"accel_noise_density": shaken})
+    of_shaken = calibration.model_copy(update={"imu": sensors})
+    if found > LARGEST_MISFIT and not misfit_with(whole, dvl, of_shaken):
+        return 0.0
+    return found
+
+
+def misfit_with(imu: Imu, dvl: Dvl, calibration: Calibration) -> float:
+    """Differences of velocities and accelerations over their sigmas by a calibration; 0 where they are usual."""
     try:
-        align_in_motion(whole, dvl, calibration.model_copy(update={"imu": sensors}))
+        align_in_motion(imu, dvl, calibration)
     except AlignmentError as error:
         return error.misfit
     except np.linalg.LinAlgError:
@@ -463,12 +472,15 @@ def misfit_of(sequence: Sequence, begin_ns: int, step_ns: int) -> float:
 
 def vibration_density(imu: Imu) -> float:
     """Noise density of the specific force by its second differences, m/s²/√Hz: motion changes little in two rows."""
-    bent = np.diff(imu.specific_force, n=2, axis=0)
+    force = imu.specific_force
+    # a driver that is faster than its sensor repeats rows
+    is_new = np.append(True, (np.diff(force, axis=0) != 0.0).any(axis=1))
+    bent = np.diff(force[is_new], n=2, axis=0)
     if not len(bent):
         return 0.0
     # the second difference of white noise has six times its variance
     sigma = 1.4826 * np.median(np.abs(bent), axis=0) / np.sqrt(6.0)  # (3,)
-    interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S
+    interval_s = float(np.median(np.diff(imu.stamps_ns[is_new]))) / NS_PER_S
     return float(sigma.max() * np.sqrt(interval_s))
 
 

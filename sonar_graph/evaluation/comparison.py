@@ -209,7 +209,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
         sequence = replace(sequence, notes={**sequence.notes, HEIGHTS: NO_HEIGHTS})
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     scores: dict[str, dict[str, Score]] = ByName(
-        {run.estimator: ByName() for run in runs}
+        {run.estimator: ByName.of_failed(run.reason) for run in runs}
     )
     # a failed run has no numbers, and must not take instants from the others
     ended = [run for run in runs if run.status != "failed"]

@@ -44,9 +44,20 @@ Named = TypeVar("Named")
 
 
 class ByName(dict[str, Named]):
-    """Values by name, in which a name that is missing is answered with those that exist."""
+    """Values by name, in which a name that is missing is answered with those that exist, or why there are none."""
+
+    failure = ""
+
+    @classmethod
+    def of_failed(cls, reason: str) -> ByName[Named]:
+        """Nothing, for a reason."""
+        empty: ByName[Named] = cls()
+        empty.failure = reason
+        return empty
 
     def __missing__(self, name: str) -> NoReturn:
+        if self.failure:
+            raise KeyError(f"{name!r}: the run failed: {self.failure}")
         raise KeyError(
             f"{name!r}{suggestion(str(name), self)} there are: {', '.join(self) or 'none'}"
         )

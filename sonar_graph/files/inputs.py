@@ -3,6 +3,7 @@
 import errno
 import json
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -56,14 +57,26 @@ def parsed_toml(text: str, path: Path, refusal: type[Exception]) -> dict[str, An
         return tomllib.loads(text)
     # the parser recurses into nested arrays
     except (ValueError, RecursionError) as error:
-        # a line of advice that was pasted into a file with a table of that name
-        is_twice = any(word in str(error) for word in ("twice", "overwrite", "mutate"))
-        advice = (
-            "; beside a table [imu], write `key = value` below it instead of `imu.key = value`, each key once"
-            if is_twice
-            else ""
+        raise refusal(f"{path}: not TOML: {error}{_twice(text, str(error))}") from error
+
+
+def _twice(text: str, fault: str) -> str:
+    """Advice about a table or key that stands twice, as a line of advice makes it that was pasted; else empty."""
+    lines = text.splitlines()
+    table = re.search(r"Cannot declare \('([^']+)'", fault)
+    at_line = re.search(r"Cannot overwrite a value \(at (?:line (\d+)|end)", fault)
+    if table is not None:
+        name = re.escape(table[1])
+        header = re.compile(rf"\s*(\[\s*{name}\s*\]|{name}\s*\.)")
+        number = next((n for n, line in enumerate(lines, 1) if header.match(line)), 0)
+        return f"; [{table[1]}] begins in line {number}: put its keys together there"
+    if at_line is not None:
+        number = int(at_line[1] or len(lines))
+        key = lines[number - 1].partition("=")[0].strip()
+        return (
+            f"; `{key}` in line {number} is set above already: keep one of both lines"
         )
-        raise refusal(f"{path}: not TOML: {error}{advice}") from error
+    return ""
 
 
 def spelt(text: str) -> str:
@@ -84,7 +97,9 @@ def read_json(
     """JSON object in a file; ``refusal`` names the file, and the remedy, where it is missing or holds anything else."""
     try:
         content = json.loads(text_of(path))
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise refusal(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
         raise refusal(f"{path}: cannot be read as JSON ({error}); {remedy}") from error
     if not isinstance(content, dict):
         found = type(content).__name__

@@ -28,7 +28,7 @@ COLUMNS = {
 MARKS = {"over-confident": " ▲", "over-cautious": " ▼"}
 NEES_LEGEND = (
     "NEES: 1 fits; ▲ over-confident, ▼ over-cautious: outside what 95 % of consistent runs with as many independent "
-    "samples have (the report has the bands)"
+    "samples have (the page of compare or report has the bands)"
 )
 RECOGNISED_BEFORE = (
     "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "

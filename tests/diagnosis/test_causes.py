@@ -189,13 +189,24 @@ def test_velocities_of_another_vehicle_are_doubtful_also_after_a_rest(rest_s: fl
     assert found.quantity == "DVL against IMU: velocities and accelerometers"
 
 
-def test_a_hull_that_shakes_contradicts_no_slow_doppler_log():
-    """Thrusters make forces noisier than the sensor at rest, of which the calibration tells."""
+@pytest.mark.parametrize("held", [1, 4])
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_hull_that_shakes_contradicts_no_doppler_log_of_its_own(
+    every: int, held: int
+):
+    """Thrusters make forces noisier than the sensor at rest, of which the calibration tells; a driver may repeat rows."""
     rng = np.random.default_rng(0)
-    run = level_vehicle(wandering(0), np.zeros(3500), 1)
-    run = replace(run, dvl=run.dvl.rows(slice(0, None, 5)))
-    shaken = run.imu.specific_force + rng.normal(0.0, 1.0, run.imu.specific_force.shape)
-    assert unlike_pair(spoilt(run, "imu", specific_force=shaken)) is None
+    own, other = (level_vehicle(wandering(seed), np.zeros(3500), 1) for seed in (0, 1))
+    shakes = rng.normal(0.0, 1.0, own.imu.specific_force.shape)
+    strong, weak = (
+        np.repeat((own.imu.specific_force + size * shakes)[::held], held, axis=0)
+        for size in (1.0, 0.3 / np.sqrt(held))
+    )
+    rows = slice(0, None, every)
+    own = replace(own, dvl=own.dvl.rows(rows))
+    assert unlike_pair(spoilt(own, "imu", specific_force=strong)) is None
+    strange = replace(own, dvl=other.dvl.rows(rows))
+    assert unlike_pair(spoilt(strange, "imu", specific_force=weak)) is not None
 
 
 @pytest.mark.parametrize("rows", [2200, 3500])

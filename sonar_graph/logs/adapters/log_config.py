@@ -63,7 +63,12 @@ class LogConfig:
         for role, table in values.items():
             if role not in ADAPTERS:
                 fault = f"there is no role [{role}]"
-                if role in Calibration.model_fields:
+                known = [one for one in ADAPTERS if one == role.lower()]
+                if known:
+                    fault += f"; did you mean [{known[0]}]?"
+                elif not isinstance(table, Mapping):
+                    fault = f"`{role} = …` belongs below a table, such as [dvl]"
+                elif role in Calibration.model_fields:
                     fault += ", which is a section of a calibration: give it with --calibration"
                 raise LogError(
                     f"{source}: {fault}; tables are for {', '.join(ADAPTERS)}"
@@ -71,6 +76,11 @@ class LogConfig:
             if not isinstance(table, Mapping):
                 fault = f"expected a table, [{role}], not {table!r}"
                 raise LogError(f"{source}: {role}: {fault}")
+            for key in table.keys() & ADAPTERS.keys():
+                raise LogError(
+                    f"{source}: [{role}] {key}: a line `{key}. … = …` belongs above the first table, or into [{key}] "
+                    f"without `{key}.`"
+                )
             shipped = [one.adapter.type for one in SHIPPED[role]]
             if "type" in table:
                 if not isinstance(table["type"], str):

@@ -68,7 +68,7 @@ class InertialPath:
     tilted_impulse: Floats
     """P, shape (n, 3, 3), m: minus the derivative of F by the gyros' bias."""
     delayed_impulse: Floats
-    """L, shape (n, 3), m/s²: derivative of F by a delay of the gyros."""
+    """L, shape (n, 3), m/s²: derivative of F by a delay of the gyros; by how much C v turns is left out."""
     rate: Floats
     """Angular rate as measured, shape (n, 3), rad/s."""
     parts: Ints
