@@ -14,11 +14,11 @@ from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.prediction import AnchoredPose, Tie
 from sonar_graph.slam.smoother import JointCovariance
-from sonar_graph.states import FIRST_ANONYMOUS_ID
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 from sonar_graph.testing.numerical import central_differences
 
 from .graphs import dense_covariance, factors_of, gtsams_solution, off_sigmas
-from .late_identities import run
+from .late_identities import assert_outcomes_account, run
 from .made import random_covariance, some_motion, values_of
 from .rail import STEP_S, rail
 
@@ -176,3 +176,26 @@ def test_names_of_landmarks_without_names_are_refused_where_these_begin():
     ):
         run(named, 1 / STEP_S, identity__unknown__policy="associate")
     assert FIRST_ANONYMOUS_ID in run(named, 1 / STEP_S).landmarks().ids
+
+
+@pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture"])
+@pytest.mark.parametrize("range_m", [1.1e5, 1e200])
+def test_a_range_beyond_any_sonar_is_refused_and_changes_nothing(
+    policy: str, range_m: float
+):
+    sequence, _ = rail(8)
+    seen = sequence.detections
+    far = seen.range_m.copy()
+    far[3] = range_m
+    estimator = run(
+        replace(sequence, detections=replace(seen, range_m=far)),
+        1 / STEP_S,
+        identity__policy=policy,
+    )
+    assert assert_outcomes_account(estimator, sequence)[Outcome.UNSOUND] == 1
+    without = replace(sequence, detections=seen.rows(np.arange(len(seen)) != 3))
+    known = run(without, 1 / STEP_S, identity__policy=policy)
+    assert np.array_equal(estimator.landmarks().positions, known.landmarks().positions)
+    assert np.array_equal(
+        estimator.trajectory().positions, known.trajectory().positions
+    )
