@@ -79,15 +79,23 @@ def polar_measurements(
     z = np.empty((len(detections), 2))
     z[:, 0] = detections.range_m
     z[:, 1] = detections.azimuth_rad
-    given = detections.range_azimuth_cov
-    # a covariance off symmetry by rounding is made symmetric
-    noise = 0.5 * (given + given.transpose(0, 2, 1))
-    if math.isnan(noise.sum()):
-        is_unknown = np.isnan(noise).any(axis=(1, 2))
-        noise[is_unknown] = np.diag(
-            [sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]
-        )
-    return z, noise
+    variances = (sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2)
+    return z, whole_covariances(detections.range_azimuth_cov, *variances)
+
+
+@compiled
+def whole_covariances(given: Floats, range_m2: float, azimuth_rad2: float) -> Floats:
+    """Covariances of range and azimuth, (m, 2, 2), symmetric; those with NaN are diagonal, of the variances."""
+    noise = np.zeros((len(given), 2, 2))
+    for k in range(len(given)):
+        # a covariance off symmetry by rounding is made symmetric
+        across = 0.5 * (given[k, 0, 1] + given[k, 1, 0])
+        is_known = not math.isnan(given[k, 0, 0] + across + given[k, 1, 1])
+        noise[k, 0, 0] = given[k, 0, 0] if is_known else range_m2
+        noise[k, 1, 1] = given[k, 1, 1] if is_known else azimuth_rad2
+        noise[k, 0, 1] = across if is_known else 0.0
+        noise[k, 1, 0] = noise[k, 0, 1]
+    return noise
 
 
 class Polar(NamedTuple):
