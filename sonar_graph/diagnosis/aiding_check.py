@@ -25,6 +25,7 @@ from sonar_graph.diagnosis.causes import (
     cause_of,
     excursion,
     of_scale,
+    pause_text,
     step_text,
 )
 from sonar_graph.diagnosis.findings import (
@@ -487,12 +488,14 @@ def findings_of(
     size = max(1.0, abs(found.gain.value))
     by_slow = check.slow_sigma(sequence) / max(found.moved, 1e-9)
     found = found.less_certain(np.hypot(by_slow, check.systematic))
-    if not found.moved * size > LEAST_MOVED * sigma:
-        return [Finding(quantity, replace(found.gain, reason=still))]
-    gain = found.gain.limited(LARGEST_GAIN_SIGMA * size, still)
+    is_still = not found.moved * size > LEAST_MOVED * sigma
+    gain = found.gain.limited(0.0 if is_still else LARGEST_GAIN_SIGMA * size, still)
     one = SensorComparison(
         check, quantity, replace(found, gain=gain), sigma, sequence, config
     )
+    if is_still:
+        # no motion is needed to see that a sensor jumps
+        return [one.jumps() or Finding(quantity, gain)]
     fault = next(filter(None, (find(one) for find in FAULTS)), None)
     if fault is not None:
         return [fault]
@@ -555,6 +558,19 @@ class SensorComparison:
         return self.contradiction(
             f"it hardly {verb} where {self.check.against} do: stuck, or not of the body",
             unused(self.check.role),
+        )
+
+    def pauses(self) -> Finding | None:
+        """No change for a part of the log, of a sensor that follows its reference else."""
+        if not self.found.gain.value > HARDLY:
+            return None
+        found = self.found.in_time() if self.is_late else self.found
+        times = pause_text(found, self.sigma)
+        if not times:
+            return None
+        return self.contradiction(
+            f"it stands still {times}, unlike {self.check.against}: its last value is repeated",
+            f"{unused(self.check.role)} leaves it out, --start and --end that time",
         )
 
     def jumps(self) -> Finding | None:
@@ -691,6 +707,7 @@ class SensorComparison:
 
 FAULTS = (
     SensorComparison.stuck,
+    SensorComparison.pauses,
     SensorComparison.jumps,
     SensorComparison.opposite,
     SensorComparison.of_cause,

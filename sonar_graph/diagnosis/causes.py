@@ -25,6 +25,7 @@ from sonar_graph.diagnosis.findings import (
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion, holes_beside
 from sonar_graph.diagnosis.signals import (
+    FEWEST_ROWS,
     Explained,
     Match,
     SignalStep,
@@ -324,6 +325,45 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
             size = np.degrees(step.size) if unit == "°" else step.size
             texts.append(f"by {size:.3g} {unit} at {step.seconds:.1f} s")
     return " and ".join(texts[:LONGEST_LIST])
+
+
+PAUSES_S = (20.0, 60.0)
+"""Lengths of the windows in which a sensor may stand still."""
+PAUSE_MOVED = 5.0
+PAUSE_NOISE = 1.5
+HARDLY_MOVED = 0.1
+
+
+def pause_text(found: Match, sigma: float) -> str:
+    """Longest time over which a sensor stands still while its reference moves; empty without any.
+
+    In a window of its rows the reference's standard deviation is `PAUSE_MOVED` of ``sigma``, that of a row, and the
+    sensor's that of its noise, or a tenth of the reference's.
+    """
+    longest = (0.0, 0.0)
+    for whole in found.whole:
+        t = whole.seconds
+        x = whole.x
+        for length_s in PAUSES_S:
+            interval_s = np.median(np.diff(t))
+            rows = max(FEWEST_ROWS, int(np.ceil(length_s / interval_s)))
+            if rows >= len(t):
+                continue
+            of_x, of_y, of_t = (
+                np.lib.stride_tricks.sliding_window_view(column, rows)
+                for column in (x, whole.y, t)
+            )
+            moved = np.std(of_x, axis=1)
+            still = np.maximum(PAUSE_NOISE * sigma, HARDLY_MOVED * moved)
+            is_paused = (moved > PAUSE_MOVED * sigma) & (np.std(of_y, axis=1) < still)
+            # a window across a hole of the log is longer
+            is_paused &= np.ptp(of_t, axis=1) < 2.0 * length_s
+            edges = np.flatnonzero(np.diff(is_paused, prepend=False, append=False))
+            for first, end in zip(edges[::2], edges[1::2], strict=True):
+                span = (float(t[first]), float(t[end + rows - 2]))
+                longest = max(longest, span, key=lambda one: one[1] - one[0])
+    begin_s, end_s = longest
+    return f"between {begin_s:.0f} and {end_s:.0f} s" if end_s else ""
 
 
 EXCURSION_OVER_S = 5.0

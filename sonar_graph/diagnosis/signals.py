@@ -39,6 +39,9 @@ MOST_OUTLYING = 0.25
 LAG_STEP_S = 0.05
 CLEARLY_BETTER = 1.5
 """Ratio of sums of squares from which on another lag, or the mirrored reference, counts."""
+BEYOND_DOUBT = 10.0
+"""Sigmas of a cause from which on `A_PART` of what is left over need be its own: a slow vehicle's noise hides it."""
+A_PART = 1.2
 STEP_ROWS = 3
 STEP_SIGMAS = 10.0
 """Far beyond the largest of a long log's differences by noise, also where it has heavy tails."""
@@ -334,9 +337,11 @@ class Explained:
 
     @property
     def is_clear(self) -> bool:
-        """True where the columns surely count, and most of what was left over is theirs."""
+        """True where the columns surely count, and most of what was left over is theirs; beyond doubt, a part of it."""
         size = float(np.linalg.norm(self.q / np.maximum(self.sigmas, 1e-12)))
-        return size > ACTING_SIGMAS and self.before > CLEARLY_BETTER * self.after
+        share = self.before / max(self.after, 1e-12)
+        is_sure = size > ACTING_SIGMAS and share > CLEARLY_BETTER
+        return is_sure or (size > BEYOND_DOUBT and share > A_PART)
 
 
 def explained(

@@ -41,6 +41,8 @@ MOST_OF_GRAVITY = 2.0
 """Beyond it, either way, it is another unit, or forces without gravity."""
 LEAST_FORCE_SCALE = 0.015
 """Gravity differs by 0.5 % over the Earth, and what accelerates a vehicle adds little."""
+SWELLS_S = 20
+"""Seconds over which a swell averages out."""
 LARGE_FORCE_SCALE = 0.1
 """From here on gaps of the Doppler log are bridged with an error of a metre after two seconds."""
 USUAL_SPEED_M_S = 3.0
@@ -181,18 +183,24 @@ def force_unit(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
 def force_scale(sequence: Sequence, config: LogConfig) -> Finding | None:
     """Typical specific force over gravity; None where the accelerometers do not measure gravity.
 
-    Of means over a second, since a hull that shakes makes single forces longer.
+    Of means over a second, since a hull that shakes makes single forces longer, and of `SWELLS_S` of these: a swell of a
+    few seconds, which meets the seconds at few phases, moves a median of them by some hundredths.
     """
     is_measured = np.isfinite(sequence.imu.specific_force).all(axis=1)
     seconds = sequence.imu.stamps_ns[is_measured] // NS_PER_S
     _, first, count = np.unique(seconds, return_index=True, return_counts=True)
     sums = np.add.reduceat(sequence.imu.specific_force[is_measured], first, axis=0)
     forces = np.linalg.norm(sums / count[:, None], axis=1)
+    if not len(forces):
+        return None
+    swells = np.array_split(forces, max(len(forces) // SWELLS_S, 1))
     gravity = sequence.calibration.gravity_m_s2
-    typical = float(np.median(forces)) if len(forces) else 0.0
+    typical = float(np.median([np.mean(swell) for swell in swells]))
     if not 1 / MOST_OF_GRAVITY < typical / gravity < MOST_OF_GRAVITY:
         return None
-    sigma = sequence.calibration.imu.accel_bias_sigma / gravity
+    # acceleration across gravity makes a force longer by a^2 / 2 g; that along it shows its size
+    across = np.median([np.var(swell) for swell in swells]) / gravity**2
+    sigma = float(np.hypot(sequence.calibration.imu.accel_bias_sigma / gravity, across))
     scale = Estimate1D(typical / gravity, sigma)
     row = Finding(
         "accelerometer scale",

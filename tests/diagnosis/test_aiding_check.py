@@ -331,6 +331,18 @@ def test_a_hull_that_shakes_makes_no_accelerometers_of_another_scale():
     assert not force_scale(run, NO_CONFIG).acts
 
 
+@pytest.mark.parametrize("phase_rad", [0.0, 0.3, 1.9, 4.0])
+def test_a_swell_makes_no_accelerometers_of_another_scale(phase_rad: float):
+    """Round and round at 1.5 m/s² every five seconds: single seconds meet it at five phases."""
+    imu = RIGHT.imu
+    phase = 2.0 * np.pi * (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9 / 5.0 + phase_rad
+    swell = 1.5 * np.column_stack([np.cos(phase), 0.0 * phase, np.sin(phase)])
+    run = spoilt(RIGHT, "imu", specific_force=imu.specific_force + swell)
+    assert not force_scale(run, NO_CONFIG).acts
+    run = spoilt(RIGHT, "imu", specific_force=1.08 * run.imu.specific_force)
+    assert force_scale(run, NO_CONFIG).acts
+
+
 @pytest.mark.parametrize("period_s", [4.0, 8.0])
 def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: float):
     """By hand: the integral of a sine over rows a second apart is too small by ``(w T)^2 / 12``."""
@@ -426,10 +438,19 @@ def acting_of_ranges(run: Sequence) -> list[Finding]:
     return [finding for finding in found if finding.acts]
 
 
-@pytest.mark.parametrize("turn_rad", [0.0, -0.6])
-def test_a_turned_sonar_is_named_with_the_mounting_that_puts_it_right(turn_rad: float):
-    azimuth_rad = SEEN.detections.azimuth_rad + turn_rad
-    found = acting_of_ranges(spoilt(SEEN, "detections", azimuth_rad=azimuth_rad))
+@pytest.mark.parametrize("noise_m", [0.0, 0.06])
+@pytest.mark.parametrize("turn_rad", [0.0, -0.4])
+def test_a_turned_sonar_is_named_with_the_mounting_that_puts_it_right(
+    turn_rad: float, noise_m: float
+):
+    """Of ranges with much noise the turn explains only a part, but beyond doubt."""
+    seen = SEEN.detections
+    noise = noise_m * np.random.default_rng(0).standard_normal(len(seen))
+    columns = {
+        "azimuth_rad": seen.azimuth_rad + turn_rad,
+        "range_m": seen.range_m + noise,
+    }
+    found = acting_of_ranges(spoilt(SEEN, "detections", **columns))
     of_sonar = "ranges to landmarks: turn of the sonar"
     assert names(found)[:1] == [of_sonar] * (turn_rad != 0)
     if turn_rad:

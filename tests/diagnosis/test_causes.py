@@ -154,6 +154,40 @@ def test_a_jump_is_called_one_and_no_unit_axes_or_delay(sensor: str):
     assert "`use = false`" in found.line
 
 
+@pytest.mark.parametrize(("step_m", "is_named"), [(1.0, True), (0.0, False)])
+def test_a_depth_that_jumps_is_named_of_a_level_vehicle_too(step_m, is_named):
+    """Without a change of depth nothing is known of its scale, but a step is none of the vehicle."""
+    run = level_drive(0)
+    z_m = (step_m * AFTER + 0.01 * NOISE[:, 0])[::10]
+    depth = Depth(run.imu.stamps_ns[::10], z_m, unstated(len(z_m)))
+    found = grave(replace(run, depth=depth))
+    assert ["by 1 m at 31" in one.cause for one in found] == [True] * is_named
+
+
+IS_PAUSED = (T > 20.0) & (T < 44.0)
+
+
+def paused(signal: np.ndarray) -> np.ndarray:
+    return np.where(IS_PAUSED, signal[np.argmax(IS_PAUSED)], signal)
+
+
+PAUSES = {
+    "depth": observed(height=paused(DIVE)),
+    "heading": observed(yaw_rad=paused(YAW)),
+    "position fixes": observed(path=paused(PATH)),
+}
+
+
+@pytest.mark.parametrize("sensor", PAUSES)
+def test_a_sensor_that_repeats_its_value_for_half_a_minute_is_named(sensor: str):
+    """Its noise goes on, as of a driver that smooths."""
+    (found,) = grave(PAUSES[sensor])
+    assert found.quantity.startswith(sensor)
+    begin_s, end_s = re.findall(r"between (\d+) and (\d+) s", found.cause)[0]
+    assert abs(int(begin_s) - 20) < 5
+    assert abs(int(end_s) - 44) < 5
+
+
 def test_velocities_that_jump_without_a_force_have_lost_the_bottom():
     run = observed()
     is_water = (run.dvl.stamps_ns > 20e9) & (run.dvl.stamps_ns < 40e9)

@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from sonar_graph.navigation.alignment.time_offset import (
+    LeastSquaresFit,
     NormalEquations,
     OffsetFit,
     SampleSeries,
@@ -181,6 +182,19 @@ def test_sigma_is_the_textbooks_between_grid_points_too(offset_s):
     assert found.is_known
     assert found.sigma == pytest.approx(textbook_sigma(offset_s), rel=0.15)
     assert abs(found.value - offset_s) < 4 * found.sigma
+
+
+@pytest.mark.parametrize("valley_s", [0.02, 0.11])
+def test_a_hollow_in_a_valley_has_the_sigma_of_the_valley(valley_s: float):
+    """Offsets nearby that fit nearly as well widen it; what the other parameters owe to the offset grows alike."""
+    P = np.array([[0.03**2, 0.02 * 0.03**2], [0.02 * 0.03**2, 0.05**2]])
+    hollow = OffsetFit(LeastSquaresFit(np.zeros(2), P, 1.0, 1.0, RATIOS), 0.0, "")
+    grid = np.linspace(-2.0, 2.0, 41)
+    wide = hollow.widened(grid, (grid / valley_s) ** 2).fit.covariance
+    assert np.sqrt(wide[0, 0]) == pytest.approx(max(0.03, valley_s))
+    assert wide[0, 1] / wide[0, 0] == pytest.approx(P[0, 1] / P[0, 0])
+    given_offset = [C[1, 1] - C[0, 1] ** 2 / C[0, 0] for C in (P, wide)]
+    assert given_offset[1] == pytest.approx(given_offset[0])
 
 
 @pytest.mark.parametrize("offset_s", [-1.93, 1.94])

@@ -321,6 +321,24 @@ class OffsetFit:
         sigma_s = float(np.sqrt(self.fit.covariance[0, 0]))
         return Estimate1D(self.offset_s, sigma_s, self.reason)
 
+    def widened(self, grid: Floats, chi2: Floats) -> OffsetFit:
+        """With the sigma that offsets of the grid have which fit nearly as well, and what the others owe to it.
+
+        Of a valley with several hollows the curvature at the bottom of one of them is too large. ``chi2``: of each
+        offset, less that of this one; a parabola has ``sigma = |offset| / sqrt(chi2)`` everywhere.
+        """
+        off_s = np.abs(grid - self.offset_s)
+        is_near = (chi2 < CLEARLY_WORSE) & (off_s > GRID_STEP_S / 2)
+        # what fits better still must not make the sigma infinite
+        sigmas_s = off_s[is_near] / np.sqrt(np.maximum(chi2[is_near], 1.0))
+        P = self.fit.covariance
+        more = np.max(sigmas_s, initial=0.0) ** 2 - P[0, 0]
+        if more <= 0:
+            return self
+        by_offset = P[:, 0] / P[0, 0]
+        covariance = P + more * np.outer(by_offset, by_offset)
+        return replace(self, fit=replace(self.fit, covariance=covariance))
+
     def without_shared_noise(
         self, stretches: Sequence[SampleSeries], column: int
     ) -> OffsetFit:
@@ -352,10 +370,13 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     limits = offset_s - 2 * GRID_STEP_S, offset_s + 2 * GRID_STEP_S
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     # ratios of the grid are up to half a step off the best offset: what is not lined up there counts as noise
+    of_grid = ratios
     offset_s = _converge(line_up, prior_sigmas, ratios, offset_s, limits).offset_s
     ratios = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas).ratios
     found = _converge(line_up, prior_sigmas, ratios, offset_s, limits)
-    return replace(found, reason=reason or found.reason)
+    here = fit(line_up(found.offset_s), prior_sigmas, of_grid)
+    chi2 = (rss - here.rss) / here.variance
+    return replace(found.widened(grid, chi2), reason=reason or found.reason)
 
 
 def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
