@@ -26,6 +26,7 @@ from sonar_graph.logs.convert import (
     read_mrclam,
     read_stpere,
     read_victoria_park,
+    with_truth,
 )
 from sonar_graph.logs.mcap import LogFile, TimeWindow, log_parts
 from sonar_graph.map_file import in_map, read_map
@@ -53,6 +54,8 @@ class LogOptions(Section):
     log_config: str | None = None
     map: str | None = None
     """Map of known landmarks, TOML or CSV."""
+    truth: str | None = None
+    """Table of true poses, ``t x y z qx qy qz qw``, in place of those of the log."""
     topics: dict[str, str] = Field(default_factory=dict)
     """By role."""
     start: str | None = None
@@ -95,14 +98,18 @@ class SourceKind:
 
 
 def _read_log(options: LogOptions) -> Sequence:
+    config = as_log_config(options.log_config, "read_log")
     sequence = read_log(
         options.log,
         calibration=options.calibration,
         topics=options.topics,
-        config=options.log_config,
+        config=config,
         window=TimeWindow.parse(options.start, options.end),
         salvage=options.salvage,
     )
+    if options.truth is not None:
+        of_truth = config.table("truth") if config else {}
+        sequence = with_truth(sequence, Path(options.truth), of_truth)
     return in_map(sequence, Path(options.map) if options.map else None)
 
 
@@ -144,7 +151,7 @@ KINDS: dict[str, SourceKind] = {
     **GENERATORS,
 }
 # options that name files: their content counts, not their path
-FILES = ("log", "folder", "calibration", "log_config", "map")
+FILES = ("log", "folder", "calibration", "log_config", "map", "truth")
 # key in fingerprints for the file of a data set that has no option for one
 FILE = "file"
 

@@ -116,6 +116,10 @@ class ReadingOptions:
         metavar="FILE",
         exists=True,
     )
+    truth: Path | None = existing_file(
+        "True poses in place of the log's: a table `t x y z qx qy qz qw` (TUM), or `t x y z`, in seconds and metres. Keys "
+        "under [truth] of --log-config hold for it."
+    )
     topics: list[str] | None = option(
         "Topic for a role, where inspect says that several fit or none; may be repeated. "
         "Roles: imu, dvl, depth, heading, positions, detections, truth, true_landmarks, sonar.",
@@ -208,6 +212,11 @@ class ReadingOptions:
 
         # the map comes last: the start that the log states goes before one that is found in a map
         sequence = read_log(log, **self.of_log, salvage=self.salvage, progress=progress)
+        if self.truth is not None:
+            from sonar_graph.logs.convert import with_truth
+
+            of_truth = self.config.table("truth") if self.config else {}
+            sequence = with_truth(sequence, self.truth, of_truth)
         return in_map(sequence, self.map)
 
 

@@ -217,7 +217,7 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str) ->
         )
 
 
-@with_options("salvage", "map")
+@with_options("salvage", "map", "truth")
 def calibration(
     reading: ReadingOptions,
     log: Path | None = argument(

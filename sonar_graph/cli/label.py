@@ -44,7 +44,7 @@ class LabelOptions:
     overwrite: Overwrite = False
 
 
-@with_options("map")
+@with_options("map", "truth")
 def label(
     log: LogPath,
     output: Path = option(

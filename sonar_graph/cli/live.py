@@ -81,7 +81,7 @@ class LiveEstimation:
         return given.get(self.estimator, {})
 
 
-@with_options("start", "end", "salvage")
+@with_options("start", "end", "salvage", "truth")
 def live(
     output: OutputFolder,
     link_options: LinkOptions,

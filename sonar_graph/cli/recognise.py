@@ -163,7 +163,7 @@ class RecognitionChoices:
     overwrite: Overwrite = False
 
 
-@with_options("start", "end", "map")
+@with_options("start", "end", "map", "truth")
 def recognise(
     log: LogPath,
     output: OutputLog,
@@ -282,7 +282,7 @@ class CalibrateOptions:
     overwrite: Overwrite = False
 
 
-@with_options("start", "end", "map")
+@with_options("start", "end", "map", "truth")
 def calibrate(
     logs: list[Path] = argument("Logs with images and truth.", "LOG...", exists=True),
     output: Path = option(

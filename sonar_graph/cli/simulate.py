@@ -33,7 +33,7 @@ Seed = Annotated[
 ]
 
 
-@with_options("start", "end", "salvage", "map")
+@with_options("start", "end", "salvage", "map", "truth")
 def landmarks(
     log: Path = option(
         "MCAP log with a reference trajectory.",

@@ -842,15 +842,14 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     sigma_m = max(fix_sigma_m(sequence)[2], float(np.median(np.abs(off - off_m))))
     if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
         return
-    cause = (
-        "another origin, sign or unit of the depths, or another height of the fixes?"
-    )
-    line = f"{unused('depth')} leaves the depths out"
+    of_fixes = origin_line(config, (0.0, 0.0, off_m), 2)
+    if "log.origin" in sequence.notes:
+        of_fixes = f"an `origin_deg_m` that is {off_m:+.2f} m higher, in geodetic under [positions] {IN_LOG_CONFIG}"
+    cause = "another origin, sign or unit of the depths, or another height or scale of the fixes?"
+    line = f"{unused('depth')} leaves the depths out; where they are right, {of_fixes}"
     if sequence.calibration.start.states():
         cause = "the depths begin at the stated start: only the heights of the fixes are wrong, of another origin or sign"
-        line = origin_line(config, (0.0, 0.0, off_m), 2)
-        if "log.origin" in sequence.notes:
-            line = f"an `origin_deg_m` that is {off_m:+.2f} m higher, in geodetic under [positions] {IN_LOG_CONFIG}"
+        line = of_fixes
     quantity = "depth: height of the position fixes over it"
     yield contradiction(quantity, cause, line, Estimate1D(off_m, sigma_m), "m")
 

@@ -18,6 +18,8 @@ from sonar_graph.evaluation import read_comparison
 from sonar_graph.logs import read_log, write_log
 from sonar_graph.simulation import BasinOptions, cruise_speed
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS
+from sonar_graph.states import Trajectory
+from sonar_graph.testing import small_world
 
 
 @pytest.mark.usefixtures("unrendered")
@@ -39,6 +41,57 @@ def test_compare_writes_what_it_names_and_report_draws_it_again(
     page.unlink()
     assert run("report", tmp_path) == 0
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
+
+
+def without_truth(tmp_path: Path) -> tuple[Path, Trajectory]:
+    world = small_world()
+    write_log(tmp_path / "untrue.mcap", replace(world, truth=None))
+    return tmp_path / "untrue.mcap", world.truth
+
+
+@pytest.mark.usefixtures("unrendered")
+@pytest.mark.parametrize("world", ["enu", "ned"])
+def test_a_table_of_true_poses_scores_as_the_log_that_has_them(
+    run, dive, tmp_path, world
+):
+    """A table in north, east, down with the key that a log configuration has for it is the same truth."""
+    log, truth = without_truth(tmp_path)
+    places = truth.positions if world == "enu" else truth.positions[:, [1, 0, 2]]
+    signs = np.array([1.0, 1.0, 1.0 if world == "enu" else -1.0])
+    seconds = truth.stamps_ns * 1e-9
+    np.savetxt(tmp_path / "xyz.txt", np.column_stack([seconds, places * signs]), "%.9f")
+    (tmp_path / "world.toml").write_text(f'[truth]\nworld = "{world}"\n')
+    given = ("--truth", tmp_path / "xyz.txt", "--log-config", tmp_path / "world.toml")
+    once = ("--estimators", "dead-reckoning")
+    assert run("compare", dive, "-o", tmp_path / "own", *once) == 0
+    assert run("compare", log, "-o", tmp_path / "given", *once, *given) == 0
+    own, same = (
+        read_comparison(tmp_path / name).scores["dead-reckoning"]["causal.ate_se2_m"]
+        for name in ("own", "given")
+    )
+    # stamps of microseconds and places of nanometres
+    assert same.value == pytest.approx(own.value, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ("0 1 2 3\n1 1 2 3\n", r"stamp_offset_s = 17\d+\.\d+` under \[truth\]"),
+        ("0 1 2 3 4\n", "5 cells; expected `t x y z qx qy qz qw`"),
+        ("t,px,py,pz\n0,1,2,3\n", r"no columns x, y, z .* `position = \[...\]` under"),
+        ("0 nan nan nan\n", "none of its 1 rows can be used"),
+    ],
+)
+def test_a_table_of_true_poses_that_cannot_be_is_refused_with_the_way_out(
+    run, tmp_path, reply, rows, told
+):
+    log, _ = without_truth(tmp_path)
+    table = tmp_path / "poses.txt"
+    table.write_text(rows)
+    answer = reply(2, "compare", log, "-o", tmp_path / "out", "--truth", table)
+    assert str(table) in answer.err
+    assert re.search(told, answer.err)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("unrendered")

@@ -2,7 +2,7 @@
 
 # fmt: off
 from sonar_graph.logs.convert.akit import read_akit
-from sonar_graph.logs.convert.csv_log import read_csv
+from sonar_graph.logs.convert.csv_log import read_csv, with_truth
 from sonar_graph.logs.convert.csv_template import csv_template
 from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.mrclam import read_mrclam
@@ -15,4 +15,5 @@ from sonar_graph.logs.convert.stpere import read_stpere
 __all__ = [
     "BagConversion", "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",
     "csv_template", "read_akit", "read_csv", "read_dlr", "read_mrclam", "read_stpere", "read_victoria_park",
+    "with_truth",
 ]

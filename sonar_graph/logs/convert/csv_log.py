@@ -15,7 +15,7 @@ of fields, and with the keys of `CsvForm`. What stands before the first table ho
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,8 @@ SHARED = CsvForm.model_fields.keys() - {"file", "columns"} | {
 """Keys that may stand before the first table, for all of them."""
 STAMP = "time"
 """Default column of the time."""
+TUM_COLUMNS = (STAMP, "x", "y", "z", "qx", "qy", "qz", "qw")
+"""Columns of a trajectory as `write_tum` writes it."""
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,85 @@ def read_csv(
     return Sequence(name=name, calibration=calibration, notes=notes, **blocks)
 
 
+def with_truth(
+    sequence: Sequence, path: Path, config: Mapping[str, Any] | None = None
+) -> Sequence:
+    """The sequence with true poses from a text table, in place of its own.
+
+    Parameters
+    ----------
+    path
+        A table: as `write_tum` writes one, ``t x y z qx qy qz qw`` in seconds and metres, ``t x y z`` alone, or with a
+        header that names the columns.
+    config
+        Keys of ``[truth]`` as for `read_csv`, such as ``stamp_offset_s``, ``world`` and ``position``.
+
+    Raises
+    ------
+    LogError
+        When the table cannot be read, or has no time in common with the sequence.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sonar_graph.logs import write_tum
+    >>> from sonar_graph.logs.convert import with_truth
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> write_tum(Path("truth.tum"), world.true_poses)
+    >>> len(with_truth(world, Path("truth.tum")).truth) == len(world.truth)
+    True
+    """
+    stated = {k: v for k, v in (config or {}).items() if k not in ("topic", "type")}
+    one = _role("truth", _columns_of_poses(CsvFile(path), stated), str(path))
+    table = _table(one, {path.name: path}, str(path))
+    truth, dropped = one.adapter.read(table, Setup())
+    if truth is None:
+        raise _useless(table, one.role, dropped)
+    first_ns, last_ns = truth.stamps_ns[[0, -1]].tolist()
+    if last_ns < sequence.start_ns or first_ns > sequence.end_ns:
+        raise LogError(
+            f"{path}: its poses are from {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, the log from "
+            f"{sequence.start_ns * 1e-9:.3f} to {sequence.end_ns * 1e-9:.3f} s; where both begin together, "
+            f"`stamp_offset_s = {(sequence.start_ns - first_ns) * 1e-9:.3f}` under [truth] in the log configuration"
+        )
+    notes = {**sequence.notes, "truth": f"poses from {path.name}"}
+    notes.pop("log.truth", None)
+    return replace(sequence, truth=truth, notes=notes)
+
+
+def _columns_of_poses(file: CsvFile, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys for a table of poses, beside those that are stated: its columns have the usual names, or none."""
+    names = tuple(file.names)
+    form = dict[str, Any]()
+    if not file.is_named:
+        names = TUM_COLUMNS[: len(names)]
+        form = {"columns": names}
+        if len(file.names) not in (4, len(TUM_COLUMNS)):
+            raise LogError(
+                f"{file.path}, line {file.first_line}: {len(file.names)} cells; expected `t x y z qx qy qz qw` or "
+                "`t x y z`, or a header that names the columns"
+            )
+    place = TUM_COLUMNS[1:4]
+    turn = TUM_COLUMNS[4:]
+    if "position" not in stated and not set(place) <= set(names):
+        raise LogError(
+            f"{file.path}: has no columns x, y, z but {', '.join(names)}; name those of the position, `position = [...]` "
+            "under [truth] in the log configuration (--log-config FILE)"
+        )
+    form |= {"stamp": names[0], "position": list(place)}
+    has_turn = set(turn) <= set(names)
+    return form | ({"orientation": list(turn)} if has_turn else {}) | dict(stated)
+
+
+def _useless(table: CsvTable, role: str, dropped: Mapping[str, int]) -> LogError:
+    """The error of a table without a row that can be used."""
+    faults = ", ".join(f"{count} {fault}" for fault, count in dropped.items())
+    return LogError(
+        f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {faults}"
+    )
+
+
 def _measurements(
     roles: Mapping[str, CsvRole], tables: Mapping[str, CsvTable]
 ) -> tuple[dict[str, Any], dict[str, str]]:
@@ -225,13 +306,10 @@ def _measurements(
         # axes of the vehicle: a mounting is of the calibration, which tables do not have
         origin, _ = common_origin(role, adapters, tables)
         rows, dropped = adapter.read(table, Setup(origin=origin))
-        faults = [f"{count} {fault}" for fault, count in dropped.items()]
         if rows is None:
-            raise LogError(
-                f"{table.file.path}: [{role}] none of its {len(table)} rows can be used: {', '.join(faults)}"
-            )
+            raise _useless(table, role, dropped)
         blocks[role] = rows
-        left_out += [f"{role}: {fault}" for fault in faults]
+        left_out += [f"{role}: {count} {fault}" for fault, count in dropped.items()]
         warnings = list(adapter.warnings(table))
         if role != "true_landmarks":
             warnings += stamp_faults(table.stamps_ns, table.stamps_ns)

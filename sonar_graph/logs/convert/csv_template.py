@@ -36,7 +36,7 @@ from sonar_graph.logs.convert.csv_evidence import (
     marked_valid,
     time_units,
 )
-from sonar_graph.logs.convert.csv_log import table_files
+from sonar_graph.logs.convert.csv_log import TUM_COLUMNS, table_files
 from sonar_graph.logs.convert.csv_table import (
     CsvFile,
     CsvForm,
@@ -59,8 +59,6 @@ _TIMES = (
 )
 """Names of columns of the time, the likeliest first."""
 _NOT_MEASURED = r"(set_?point|desired|demand|command|cmd|err|error|std|sigma|var|cov|bias|uncertainty)(_|$)"
-TUM_COLUMNS = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
-"""Columns of a trajectory as `write_tum` writes it."""
 _DEPTHS = ("height", "pressure")
 _LISTS = ("ids", "probabilities")
 """Keys with a column for each candidate."""
