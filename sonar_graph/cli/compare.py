@@ -97,7 +97,9 @@ def run(
     ):
         write_comparison(comparison, output)
         write_viewer_files(comparison, output)
-    print_outcome(comparison, f"Results: {output}")
+    print_outcome(
+        comparison, f"Results: {output}; `sonar-graph report {output}` draws the page"
+    )
 
 
 def compare(

@@ -224,7 +224,7 @@ def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Compa
     if not true or not ended:
         why = "no run has a pose"
         if not true:
-            why = "the log has no truth, so no trajectory error can be given"
+            why = "the log has no truth, so no trajectory error can be given; `--truth FILE` gives it one"
         environment["scored instants"] = f"none: {why}"
         return comparison
     scored = scored_instants(instants_ns, true, runs)

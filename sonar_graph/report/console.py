@@ -118,7 +118,7 @@ def _lines_below(comparison: Comparison) -> list[str]:
         if "landmarks.se2_m" in present:
             lines.append(f"map: {label(SCORES['landmarks.se2_m'].label, comparison)}")
         why = environment["scored instants"].removeprefix("none: ")
-        return [*lines, f"No position errors: {why}"]
+        return [*lines, *sentences.ends(comparison), f"No position errors: {why}"]
     if metric != RAW:
         lines.append(f"aligned: {label(SCORES[f'causal.{metric}'].label, comparison)}")
     if f"causal.{RAW}" in present:

@@ -114,6 +114,24 @@ def failed_lines(comparison: Comparison) -> list[str]:
     return [f"{own} failed: {reason}." for reason, own in names.items()]
 
 
+def ends(comparison: Comparison) -> list[str]:
+    """Where the path of each run ends, how sure of it the run is, and how many landmarks it has."""
+    lines = list[str]()
+    for run in comparison.runs:
+        if not run.causal:
+            continue
+        x, y, z = run.causal.positions[-1]
+        # the trace is the same along any axes
+        sigma_m = math.sqrt(np.trace(run.causal.covariances[-1, 3:, 3:]))
+        text = f"{run.estimator} ends at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        if math.isfinite(sigma_m):
+            text += f" with a sigma of {sigma_m:.2g} m in all"
+        if run.landmarks:
+            text += f", {counted(len(run.landmarks), 'landmark')}"
+        lines.append(text)
+    return lines
+
+
 def named_by(pairs: Iterable[tuple[Said, str]]) -> dict[Said, str]:
     """Each thing that runs have, with the names of the runs: most have the same, and one line is enough for all."""
     names: dict[Said, list[str]] = {}
