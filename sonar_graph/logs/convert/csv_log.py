@@ -242,7 +242,8 @@ def with_truth(
     stated = {k: v for k, v in (config or {}).items() if k not in ("topic", "type")}
     one = _role("truth", _columns_of_poses(CsvFile(path), stated), str(path))
     table = _table(one, {path.name: path}, str(path))
-    truth, dropped = one.adapter.read(table, Setup())
+    adapter: Any = one.adapter
+    truth, dropped = adapter.read(table, Setup())
     if truth is None:
         raise _useless(table, one.role, dropped)
     first_ns, last_ns = truth.stamps_ns[[0, -1]].tolist()
