@@ -52,7 +52,7 @@ def without_truth(tmp_path: Path) -> tuple[Path, Trajectory]:
 @pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize("world", ["enu", "ned"])
 def test_a_table_of_true_poses_scores_as_the_log_that_has_them(
-    run, dive, tmp_path, world
+    run, dive, tmp_path, reply, world
 ):
     """A table in north, east, down with the key that a log configuration has for it is the same truth."""
     log, truth = without_truth(tmp_path)
@@ -62,9 +62,12 @@ def test_a_table_of_true_poses_scores_as_the_log_that_has_them(
     np.savetxt(tmp_path / "xyz.txt", np.column_stack([seconds, places * signs]), "%.9f")
     (tmp_path / "world.toml").write_text(f'[truth]\nworld = "{world}"\n')
     given = ("--truth", tmp_path / "xyz.txt", "--log-config", tmp_path / "world.toml")
+    with (tmp_path / "xyz.txt").open("a") as table:
+        table.write("1800000000 nan 1 2\n")
     once = ("--estimators", "dead-reckoning")
     assert run("compare", dive, "-o", tmp_path / "own", *once) == 0
-    assert run("compare", log, "-o", tmp_path / "given", *once, *given) == 0
+    told = reply(0, "compare", log, "-o", tmp_path / "given", *once, *given).out
+    assert "left out: truth: 1 " in told
     own, same = (
         read_comparison(tmp_path / name).scores["dead-reckoning"]["causal.ate_se2_m"]
         for name in ("own", "given")

@@ -251,10 +251,14 @@ def with_truth(
         raise LogError(
             f"{path}: its poses are from {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, the log from "
             f"{sequence.start_ns * 1e-9:.3f} to {sequence.end_ns * 1e-9:.3f} s; where both begin together, "
-            f"`stamp_offset_s = {(sequence.start_ns - first_ns) * 1e-9:.3f}` under [truth] in the log configuration"
+            f"`stamp_offset_s = {(sequence.start_ns - first_ns) * 1e-9:.3f}` under [truth] in the log configuration, "
+            "`stamp_unit_s` there for times that are not in seconds"
         )
     notes = {**sequence.notes, "truth": f"poses from {path.name}"}
     notes.pop("log.truth", None)
+    if faults := _left_out("truth", dropped):
+        before = notes.get("log.dropped")
+        notes["log.dropped"] = "; ".join(filter(None, (before, *faults)))
     return replace(sequence, truth=truth, notes=notes)
 
 
@@ -280,6 +284,10 @@ def _columns_of_poses(file: CsvFile, stated: Mapping[str, Any]) -> dict[str, Any
     form |= {"stamp": names[0], "position": list(place)}
     has_turn = set(turn) <= set(names)
     return form | ({"orientation": list(turn)} if has_turn else {}) | dict(stated)
+
+
+def _left_out(role: str, dropped: Mapping[str, int]) -> list[str]:
+    return [f"{role}: {count} {fault}" for fault, count in dropped.items()]
 
 
 def _useless(table: CsvTable, role: str, dropped: Mapping[str, int]) -> LogError:
@@ -310,7 +318,7 @@ def _measurements(
         if rows is None:
             raise _useless(table, role, dropped)
         blocks[role] = rows
-        left_out += [f"{role}: {count} {fault}" for fault, count in dropped.items()]
+        left_out += _left_out(role, dropped)
         warnings = list(adapter.warnings(table))
         if role != "true_landmarks":
             warnings += stamp_faults(table.stamps_ns, table.stamps_ns)
