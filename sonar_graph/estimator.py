@@ -13,7 +13,10 @@ and so may a function that makes an estimator. `sonar_graph.testing.check_estima
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from inspect import signature
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
 
 from sonar_graph.calibration import Calibration, KnownMap, Section
 from sonar_graph.errors import EstimatorError, SonarGraphError, UnknownEstimatorError
@@ -187,11 +190,33 @@ def returned(value: object, kind: type[Returned], method: str) -> Returned:
 
 def returned_estimate(value: object) -> Estimate | None:
     """A value that `Estimator.process` returned; an `EstimatorError` where it is neither an estimate nor None."""
-    if value is None or isinstance(value, Estimate):
-        return value
-    raise EstimatorError(
-        f"process returned {article(value)}, not an Estimate(stamp_ns, world_T_body, covariance) or None"
-    )
+    if value is None:
+        return None
+    if not isinstance(value, Estimate):
+        raise EstimatorError(
+            f"process returned {article(value)}, not an Estimate(stamp_ns, world_T_body, covariance) or None"
+        )
+    if np.shape(value.covariance) != (6, 6):
+        raise EstimatorError(
+            f"process returned an Estimate with a covariance of shape {np.shape(value.covariance)}; expected (6, 6), of "
+            "[rotation, translation] in the axes of the body"
+        )
+    return value
+
+
+def require_call(make: Callable[..., object], words: tuple[str, ...]) -> None:
+    """Raise an `EstimatorError` where a class or function does not take these arguments, in this order."""
+    try:
+        call = signature(make)
+    # of classes written in C
+    except ValueError:
+        return
+    try:
+        call.bind(*words)
+    except TypeError as error:
+        raise EstimatorError(
+            f"{getattr(make, '__name__', make)}{call} is called as ({', '.join(words)}): {error}"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -294,6 +319,7 @@ def name_of(estimator: EstimatorChoice) -> str:
             raise EstimatorError(
                 f"the class {own} lacks {missing} of the estimator contract; see help(sonar_graph.Estimator)"
             )
+        require_call(estimator, ("calibration", "odometry", "params"))
         place = f"{estimator.__module__}:{own}"
         installed = installed_estimators().items()
         return next((name for name, point in installed if point.value == place), own)
@@ -307,6 +333,7 @@ def name_of(estimator: EstimatorChoice) -> str:
             "a function that makes an estimator needs a name for the results: "
             "def my_filter(calibration, odometry): return ..."
         )
+    require_call(estimator, ("calibration", "odometry"))
     return own
 
 

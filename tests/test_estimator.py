@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from typing import ClassVar
 
@@ -142,6 +143,20 @@ class Tuples(DeadReckoning):
         return (measurements.end_ns, None)
 
 
+class Flat(DeadReckoning):
+    """Is sure of x, y and heading only."""
+
+    def process(self, measurements):
+        estimate = super().process(measurements)
+        return None if estimate is None else replace(estimate, covariance=np.eye(3))
+
+
+class OfCalibration(DeadReckoning):
+    """Takes no source of motion."""
+
+    def __init__(self, calibration): ...
+
+
 def tilted(calibration, odometry):
     """Dead reckoning with a setting of its own."""
     return DeadReckoning(calibration, odometry, DeadReckoning.Params())
@@ -181,6 +196,8 @@ def test_what_is_no_estimator_is_refused_before_anything_runs():
         ([{"isam2": {}}], "a function that makes one, not {'isam2'"),
         ([OnlyTrajectory], "OnlyTrajectory lacks process, landmarks, detections of"),
         ([lambda *_: instance], "needs a name for the results"),
+        ([OfCalibration], r"\(calibration\) is called as \(calibration, odometry, par"),
+        ([small_world], r"small_world\(.*\) .* is called as \(calibration, odometry\)"),
         (["dead-reckoning", DeadReckoning], "more than once: dead-reckoning"),
         ("isam2", r"estimators is a list: give \['isam2'\]"),
         (DeadReckoning, r"estimators is a list: give \[DeadReckoning\]"),
@@ -203,6 +220,7 @@ def test_what_is_no_estimator_is_refused_before_anything_runs():
         (Asleep, "process never returned an estimate"),
         (NoMap, r"landmarks\(\) returned None, .* return LandmarkMap.empty\(\)"),
         (Tuples, "process returned a tuple, not an Estimate"),
+        (Flat, r"a covariance of shape \(3, 3\); expected \(6, 6\)"),
         (lambda *_: None, "what was made is None, which lacks process, trajectory"),
     ],
 )
