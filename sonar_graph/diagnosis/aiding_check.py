@@ -999,11 +999,15 @@ def heading_turn(
     first = "once the gyro bias is put right, which comes first, " if is_biased else ""
     sigma = np.hypot(right.calibration.heading.sigma_rad, allowed)
     large_rad = min(LARGE_TURN_RAD, GRAVE_ERROR * sigma)
+    starts_so = right.calibration.start.states("rpy_rad") and not any(
+        start_heading_findings(right, motion)
+    )
+    of_fixes = f"; or {unused('positions')}, whose world is turned: the stated start agrees with the heading"
     yield replace(
         row,
         cause=f"{first}{sense}either its world, north or mounting is another",
-        line=f"{of_sense}`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}{OR_DVL} is turned on the "
-        f"vehicle: `dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
+        line=f"{of_sense}`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}{of_fixes if starts_so else ''}"
+        f"{OR_DVL} is turned on the vehicle: `dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
         gravity=gravity_of(abs(angle.value) > large_rad),
     )
 

@@ -246,6 +246,21 @@ def test_a_heading_with_an_offset_is_found_from_positions(places: str, before):
         assert not [f for f in heading_findings(turned, config) if f.acts]
 
 
+@pytest.mark.parametrize("is_heading_wrong", [True, False])
+def test_fixes_of_a_turned_world_are_asked_where_the_start_agrees_with_the_heading(
+    is_heading_wrong: bool,
+):
+    off_rad = 0.35
+    turn = Rotation.from_euler("z", 0.0 if is_heading_wrong else -off_rad)
+    run = compass(RIGHT, lambda yaw_rad: yaw_rad + off_rad * is_heading_wrong)
+    run = fixed(run)
+    run = spoilt(run, "positions", position_m=turn.apply(run.positions.position_m))
+    *_, found = heading_findings(replace(run, truth=None))
+    assert found.estimate.value == pytest.approx(np.degrees(-off_rad), abs=2.0)
+    asks_fixes = "`use = false` under [positions]" in found.line
+    assert asks_fixes == (not is_heading_wrong)
+
+
 @pytest.mark.parametrize(
     ("run", "is_upside_down"),
     [(compass(RIGHT), True), (RIGHT, False)],
