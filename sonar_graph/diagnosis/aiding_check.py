@@ -16,6 +16,7 @@ from sonar_graph.diagnosis.causes import (
     AS_GOOD,
     DEVIATION,
     DRIFT,
+    LEAST_DRIFT_M_S,
     OF_FIXES,
     OF_RANGES,
     PITCH,
@@ -152,6 +153,8 @@ class Check:
     """Sigma of the gain by what the comparison leaves out."""
     slow_sigma: Callable[[Sequence], float] = lambda _: 0.0
     """Error of sensor and reference that changes as slowly as the motion, in the sensor's unit: blocks of rows hide it."""
+    drift: Callable[[Sequence], float] = lambda _: 0.0
+    """How fast the reference may drift, in the sensor's unit a second, where nothing is wrong."""
     least_scale: float = 0.03
     least_lag_s: float = 0.1
     reach: Callable[[Sequence, Match], float] = lambda _, found: found.moved
@@ -343,6 +346,7 @@ DEPTH = Check(
     compare=depth_match,
     sigma=lambda sequence: max(sequence.calibration.depth.sigma_m, 0.02),
     slow_sigma=climb_sigma,
+    drift=lambda _: LEAST_DRIFT_M_S,
     causes=(PITCH, DRIFT),
     step_unit="m",
     units=LENGTHS | PRESSURES,
@@ -358,6 +362,7 @@ HEADING = Check(
     compare=heading_match,
     sigma=lambda sequence: sequence.calibration.heading.sigma_rad,
     slow_sigma=slow_heading_sigma,
+    drift=lambda sequence: 3.0 * sequence.calibration.imu.gyro_bias_sigma,
     units=DEGREES,
     sense=lambda _, config: Advice(
         "it turns against the gyros, clockwise", other_world(config, "heading")
@@ -565,7 +570,7 @@ class SensorComparison:
         if not self.found.gain.value > HARDLY:
             return None
         found = self.found.in_time() if self.is_late else self.found
-        times = pause_text(found, self.sigma)
+        times = pause_text(found, self.sigma, self.check.drift(self.sequence))
         if not times:
             return None
         return self.contradiction(

@@ -330,40 +330,69 @@ def step_text(found: Match, sigma: float, unit: str, ratio: float) -> str:
 PAUSES_S = (20.0, 60.0)
 """Lengths of the windows in which a sensor may stand still."""
 PAUSE_MOVED = 5.0
+PAUSE_LACKED = 3.0
 PAUSE_NOISE = 1.5
 HARDLY_MOVED = 0.1
 
 
-def pause_text(found: Match, sigma: float) -> str:
+def pause_text(found: Match, sigma: float, drift: float) -> str:
     """Longest time over which a sensor stands still while its reference moves; empty without any.
 
-    In a window of its rows the reference's standard deviation is `PAUSE_MOVED` of ``sigma``, that of a row, and the
-    sensor's that of its noise, or a tenth of the reference's.
+    In a window of its rows the reference's standard deviation is `PAUSE_MOVED` of ``sigma``, that of a row, beyond a
+    ``drift`` in its unit a second, and the sensor's that of its noise, or a tenth of the reference's. What it lacks there is
+    `PAUSE_LACKED` times what it lacks in a quarter of the shorter windows: of a vehicle that keeps its depth the reference
+    may drift all the time.
     """
     longest = (0.0, 0.0)
     for whole in found.whole:
         t = whole.seconds
-        x = whole.x
+        x = turned_to(whole.y, whole.x)
+        lacked_a_second = np.inf
         for length_s in PAUSES_S:
-            interval_s = np.median(np.diff(t))
+            interval_s = float(np.median(np.diff(t)))
+            # stamps that are cut to seconds
+            if not interval_s > 0.0:
+                continue
             rows = max(FEWEST_ROWS, int(np.ceil(length_s / interval_s)))
             if rows >= len(t):
                 continue
-            of_x, of_y, of_t = (
-                np.lib.stride_tricks.sliding_window_view(column, rows)
-                for column in (x, whole.y, t)
+            moved, by_y, lacked = (
+                spreads(signal, rows) for signal in (x, whole.y, whole.y - x)
             )
-            moved = np.std(of_x, axis=1)
+            if not np.isfinite(lacked).any():
+                continue
             still = np.maximum(PAUSE_NOISE * sigma, HARDLY_MOVED * moved)
-            is_paused = (moved > PAUSE_MOVED * sigma) & (np.std(of_y, axis=1) < still)
+            of_quarter = np.percentile(lacked[np.isfinite(lacked)], 25.0)
+            lacked_a_second = min(lacked_a_second, of_quarter / length_s)
+            usual = max(lacked_a_second * length_s, sigma)
+            # the standard deviation of a line
+            drifted = drift * length_s / np.sqrt(12.0)
+            is_paused = (moved > PAUSE_MOVED * sigma + drifted) & (by_y < still)
+            is_paused &= lacked > PAUSE_LACKED * usual
             # a window across a hole of the log is longer
-            is_paused &= np.ptp(of_t, axis=1) < 2.0 * length_s
+            is_paused &= t[rows - 1 :] - t[: len(t) - rows + 1] < 2.0 * length_s
             edges = np.flatnonzero(np.diff(is_paused, prepend=False, append=False))
             for first, end in zip(edges[::2], edges[1::2], strict=True):
                 span = (float(t[first]), float(t[end + rows - 2]))
                 longest = max(longest, span, key=lambda one: one[1] - one[0])
     begin_s, end_s = longest
     return f"between {begin_s:.0f} and {end_s:.0f} s" if end_s else ""
+
+
+def spreads(values: Values, rows: int) -> Floats:
+    """Standard deviation of so many rows from each one on, shape (n - rows + 1,); NaN where one of them is not known."""
+    known = np.isfinite(values)
+    if not known.any():
+        return np.full(len(values) - rows + 1, np.nan)
+    centred = np.where(known, values - np.mean(values[known]), 0.0)
+
+    def mean(columns: Values) -> Values:
+        sums = np.append(0.0, np.cumsum(columns))
+        return (sums[rows:] - sums[:-rows]) / rows
+
+    variance = mean(np.abs(centred) ** 2).real - np.abs(mean(centred)) ** 2
+    is_whole = mean(known.astype(float)) > 1.0 - 0.5 / rows
+    return np.where(is_whole, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
 
 EXCURSION_OVER_S = 5.0

@@ -190,7 +190,7 @@ def test_a_hollow_in_a_valley_has_the_sigma_of_the_valley(valley_s: float):
     P = np.array([[0.03**2, 0.02 * 0.03**2], [0.02 * 0.03**2, 0.05**2]])
     hollow = OffsetFit(LeastSquaresFit(np.zeros(2), P, 1.0, 1.0, RATIOS), 0.0, "")
     grid = np.linspace(-2.0, 2.0, 41)
-    wide = hollow.widened(grid, (grid / valley_s) ** 2).fit.covariance
+    wide = hollow.widened(grid, (grid / valley_s) ** 2).covariance
     assert np.sqrt(wide[0, 0]) == pytest.approx(max(0.03, valley_s))
     assert wide[0, 1] / wide[0, 0] == pytest.approx(P[0, 1] / P[0, 0])
     given_offset = [C[1, 1] - C[0, 1] ** 2 / C[0, 0] for C in (P, wide)]

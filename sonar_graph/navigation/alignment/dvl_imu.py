@@ -266,7 +266,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
             found = search_offset(line_up, PRIOR_SIGMAS)
             found = found.without_shared_noise(line_up(found.offset_s), SCALE)
         parameters = found.fit.parameters
-        sigma = np.sqrt(np.diag(found.fit.covariance))
+        sigma = np.sqrt(np.diag(found.covariance))
         turn = parameters[TURN]
         # a large turn leaves residuals that make its sigma large
         is_sure = (sigma[TURN] <= TURN_LIMITS_RAD) | (np.abs(turn) > SURE * sigma[TURN])

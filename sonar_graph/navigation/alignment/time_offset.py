@@ -270,6 +270,8 @@ PRIOR_OFFSET_S = 10.0
 CLEARLY_WORSE = 16.0
 """Least chi-square by which any other minimum must be worse: four sigmas."""
 NEIGHBOURHOOD_S = 0.3
+HOLLOWS_S = 0.5
+"""Distance up to which hollows of one valley are looked for; others are rivals."""
 ROUNDS = 6
 SETTLED_SIGMAS = 0.5
 """Largest last step of an offset that is known: its square would add a quarter to the variance."""
@@ -316,28 +318,32 @@ class OffsetFit:
     reason: str
     """Why the offset is not known; empty: it is."""
 
+    hollow_s2: float = 0.0
+    """Variance of the offset beyond the fit's: of a valley with several hollows the curvature in one is too large."""
+
+    @property
+    def covariance(self) -> Floats:
+        """Of all parameters, shape (p, p), with what they owe to an offset that is less certain than the fit says."""
+        P = self.fit.covariance
+        by_offset = P[:, 0] / P[0, 0]
+        return P + self.hollow_s2 * np.outer(by_offset, by_offset)
+
     def offset(self) -> Estimate1D:
         """The offset as a number."""
-        sigma_s = float(np.sqrt(self.fit.covariance[0, 0]))
+        sigma_s = float(np.sqrt(self.covariance[0, 0]))
         return Estimate1D(self.offset_s, sigma_s, self.reason)
 
-    def widened(self, grid: Floats, chi2: Floats) -> OffsetFit:
-        """With the sigma that offsets of the grid have which fit nearly as well, and what the others owe to it.
+    def widened(self, neighbours_s: Floats, chi2: Floats) -> OffsetFit:
+        """With the sigma that neighbouring offsets have which fit nearly as well.
 
-        Of a valley with several hollows the curvature at the bottom of one of them is too large. ``chi2``: of each
-        offset, less that of this one; a parabola has ``sigma = |offset| / sqrt(chi2)`` everywhere.
+        ``chi2``: of each, less that of this one; a parabola has ``sigma = |offset| / sqrt(chi2)`` everywhere.
         """
-        off_s = np.abs(grid - self.offset_s)
+        off_s = np.abs(neighbours_s - self.offset_s)
         is_near = (chi2 < CLEARLY_WORSE) & (off_s > GRID_STEP_S / 2)
         # what fits better still must not make the sigma infinite
         sigmas_s = off_s[is_near] / np.sqrt(np.maximum(chi2[is_near], 1.0))
-        P = self.fit.covariance
-        more = np.max(sigmas_s, initial=0.0) ** 2 - P[0, 0]
-        if more <= 0:
-            return self
-        by_offset = P[:, 0] / P[0, 0]
-        covariance = P + more * np.outer(by_offset, by_offset)
-        return replace(self, fit=replace(self.fit, covariance=covariance))
+        more = np.max(sigmas_s, initial=0.0) ** 2 - self.fit.covariance[0, 0]
+        return replace(self, hollow_s2=max(float(more), 0.0))
 
     def without_shared_noise(
         self, stretches: Sequence[SampleSeries], column: int
@@ -370,13 +376,14 @@ def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     limits = offset_s - 2 * GRID_STEP_S, offset_s + 2 * GRID_STEP_S
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     # ratios of the grid are up to half a step off the best offset: what is not lined up there counts as noise
-    of_grid = ratios
     offset_s = _converge(line_up, prior_sigmas, ratios, offset_s, limits).offset_s
     ratios = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas).ratios
     found = _converge(line_up, prior_sigmas, ratios, offset_s, limits)
-    here = fit(line_up(found.offset_s), prior_sigmas, of_grid)
-    chi2 = (rss - here.rss) / here.variance
-    return replace(found.widened(grid, chi2), reason=reason or found.reason)
+    here = fit(line_up(found.offset_s), prior_sigmas, ratios)
+    near_s = grid[np.abs(grid - found.offset_s) < HOLLOWS_S]
+    near = np.array([fit(line_up(at_s), prior_sigmas, ratios).rss for at_s in near_s])
+    found = found.widened(near_s, (near - here.rss) / here.variance)
+    return replace(found, reason=reason or found.reason)
 
 
 def reason_not_unique(grid: Floats, chi2: Floats, best: int) -> str:
