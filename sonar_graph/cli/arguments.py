@@ -118,7 +118,7 @@ class ReadingOptions:
     )
     truth: Path | None = existing_file(
         "True poses in place of the log's: a table `t x y z qx qy qz qw` (TUM), or `t x y z`, in seconds and metres. Keys "
-        "under [truth] of --log-config hold for it."
+        "of the table truth in --log-config hold for it, unless they are of a topic."
     )
     topics: list[str] | None = option(
         "Topic for a role, where inspect says that several fit or none; may be repeated. "

@@ -406,6 +406,15 @@ POSITIONS = Check(
     causes=(OF_FIXES,),
     step_unit="m",
 )
+REFERENCE = replace(
+    POSITIONS,
+    name="reference",
+    role="truth",
+    quantity="reference: path over that by gyros and Doppler log",
+    units=LENGTHS,
+    other_lines={},
+)
+"""True positions, which are compared in unit, sense and delay alone."""
 SIGHTINGS = partial(Check, role="detections", against="the motion between frames")
 RANGE = SIGHTINGS(
     name="ranges to landmarks",

@@ -27,8 +27,10 @@ from sonar_graph.diagnosis.aiding_check import (
     OTHER_UNIT,
     POSITIONS,
     RANGE,
+    REFERENCE,
     VERTICAL_BIAS,
     Check,
+    SensorComparison,
     begins_below_water,
     findings_of,
     fix_height_findings,
@@ -99,7 +101,11 @@ from sonar_graph.diagnosis.start import (
     with_fitted,
     without_bias,
 )
-from sonar_graph.diagnosis.start_place import map_findings, start_place_findings
+from sonar_graph.diagnosis.start_place import (
+    FROM_TRUTH,
+    map_findings,
+    start_place_findings,
+)
 from sonar_graph.diagnosis.turn_rate import scaled_gyros, turn_rate_finding
 from sonar_graph.diagnosis.turned_sensor import EITHER, TurnedPair
 from sonar_graph.diagnosis.units import (
@@ -425,6 +431,9 @@ class SensorCheck:
         self.join_vertical_bias()
         self.doubt_arm()
         self.reference = list(reference_findings(right, self.config, tilt))
+        # a truth in another unit or of other axes begins elsewhere too
+        if any(f.quantity == REFERENCE.quantity for f in self.reference):
+            self.by_motion = [f for f in self.by_motion if f.quantity != FROM_TRUTH]
         start = right.calibration.start
         if start.states("rpy_rad"):
             off = tilt.angle(1).minus(start.rpy_rad[1])
@@ -1112,9 +1121,9 @@ def reference_findings(
     """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
     reference = right.true_poses
-    mirrored = list(mirrored_reference(right, config))
-    yield from mirrored
-    if reference is None or mirrored:
+    of_path = list(reference_path_findings(right, config))
+    yield from of_path
+    if reference is None or of_path:
         yield from tilt_findings(tilt, right.calibration, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, reference, right.calibration)
@@ -1139,8 +1148,8 @@ def reference_findings(
     yield from of_heading
 
 
-def mirrored_reference(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
-    """A reference whose level path is the mirror image of that by gyros and Doppler log; nothing where it is not."""
+def reference_path_findings(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
+    """A reference whose level path is that by gyros and Doppler log mirrored, in another unit or late; nothing if right."""
     motion = BodyMotion.of(sequence)
     truth = sequence.truth
     if motion is None or truth is None:
@@ -1148,10 +1157,24 @@ def mirrored_reference(sequence: Sequence, config: LogConfig) -> Iterator[Findin
     unknown_m2 = np.full((len(truth), 3, 3), np.nan)
     places = PositionFixes(truth.stamps_ns, truth.positions, unknown_m2)
     found = fix_match(replace(sequence, positions=places), motion)
-    if found is None or not found.is_mirrored or found.misfit >= MOST_MISFIT:
+    if found is None or not found.gain.is_known or found.misfit >= MOST_MISFIT:
+        return
+    if not found.is_mirrored:
+        one = SensorComparison(
+            REFERENCE, REFERENCE.quantity, found, LEAST_LATE_M, sequence, config
+        )
+        unit = one.other_unit() if one.units else None
+        delay = one.delay()
+        if unit is not None:
+            yield unit
+        # to two seconds orientations show it better
+        elif delay.acts and (
+            sequence.true_poses is None or abs(delay.estimate.value) > LATE_S
+        ):
+            yield delay
         return
     yield contradiction(
-        "reference: path over that by gyros and Doppler log",
+        REFERENCE.quantity,
         "it is its mirror image: north, east, down instead of east, north, up; all errors are of that",
         f'{other_world(config, "truth")}, and `rotation = "frd"` where its orientations are of a body with z down; or the '
         "fields of position in another order",
@@ -1159,6 +1182,8 @@ def mirrored_reference(sequence: Sequence, config: LogConfig) -> Iterator[Findin
     )
 
 
+LEAST_LATE_M = 0.3
+LATE_S = 1.8
 FEWEST_STATED = 20
 LARGEST_STATED = 20.0
 """Stated sigma of velocities over their scatter from row to row, from which on it is in another unit."""

@@ -417,7 +417,7 @@ def steps(
     if doubt is not None:
         size[size < np.nan_to_num(doubt[known])] = 0.0
     typical = float(np.median(near)) if len(t) > FEWEST_ROWS else np.inf
-    least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma)
+    least = max(STEP_SIGMAS * typical, LEAST_STEP * sigma, 1.5 * resolution(y[known]))
     found = list[SignalStep]()
     while len(size) and size.max() > least:
         k = int(np.argmax(size))
@@ -426,6 +426,14 @@ def steps(
             return []
         size[max(k - 3 * STEP_ROWS, 0) : k + 3 * STEP_ROWS] = 0.0
     return sorted(found)
+
+
+def resolution(y: Values) -> float:
+    """Typical change of a sensor whose rows mostly repeat; 0 of others."""
+    moves = np.linalg.norm(np.diff(as_columns(y), axis=0), axis=1)
+    is_move = moves > 0.0
+    is_coarse = is_move.any() and np.mean(is_move) < 0.5
+    return float(np.median(moves[is_move])) if is_coarse else 0.0
 
 
 def as_columns(values: Values) -> Floats:

@@ -150,6 +150,9 @@ def stated_start_findings(
     )
 
 
+FROM_TRUTH = "start position: distance from the truth"
+
+
 def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
     """The truth at the start; None where they agree or the truth begins later."""
     truth = right.truth
@@ -168,10 +171,11 @@ def truth_finding(right: Sequence, motion: BodyMotion) -> Finding | None:
     if off_m <= FARTHEST_M + way_m + ACTING_SIGMAS * sigma_m:
         return None
     return contradiction(
-        "start position: distance from the truth",
+        FROM_TRUTH,
         estimate=Estimate1D(off_m, sigma_m),
         unit="m",
         cause=f"the truth begins {off_m:.2f} m from the start of the calibration: a log that is joined after its beginning, "
         "or another world of the truth?",
-        line=f"`start.position_m = {numbers((x, y, start.position_m[2]), 2)}` {IN_CALIBRATION}",
+        line=f"`start.position_m = {numbers((x, y, start.position_m[2]), 2)}` {IN_CALIBRATION}; where the truth has a world "
+        "of its own, as of a motion capture, read the aligned errors",
     )

@@ -16,6 +16,7 @@ from sonar_graph.cli.compare import DEMO
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation import read_comparison
 from sonar_graph.logs import read_log, write_log
+from sonar_graph.logs.convert import with_truth
 from sonar_graph.simulation import BasinOptions, cruise_speed
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS
 from sonar_graph.states import Trajectory
@@ -77,11 +78,45 @@ def test_a_table_of_true_poses_scores_as_the_log_that_has_them(
 
 
 @pytest.mark.parametrize(
+    "header",
+    [
+        "# timestamp tx ty tz qx qy qz qw\n",
+        "time,x,y,z\n",
+        "seq,time,pos_x,pos_y,pos_z\n",
+    ],
+)
+def test_columns_of_true_poses_are_known_by_their_usual_names(tmp_path, header):
+    _, truth = without_truth(tmp_path)
+    names = header.strip("# \n").replace(",", " ").split()
+    columns = {
+        **dict.fromkeys(("timestamp", "time"), truth.stamps_ns * 1e-9),
+        **dict(zip(("qx", "qy", "qz", "qw"), truth.quaternions_xyzw.T, strict=True)),
+        "seq": np.arange(len(truth)),
+    }
+    cells = [
+        columns[name] if name in columns else truth.positions[:, "xyz".index(name[-1])]
+        for name in names
+    ]
+    mark = "," if "," in header else " "
+    table = tmp_path / "poses.txt"
+    with table.open("w") as file:
+        file.write(header)
+        np.savetxt(file, np.column_stack(cells), "%.9f", delimiter=mark)
+    found = with_truth(small_world(), table).truth
+    assert np.abs(found.stamps_ns - truth.stamps_ns).max() < 1000
+    np.testing.assert_allclose(found.positions, truth.positions, atol=1e-8)
+    assert found.has_orientation == ("qw" in names)
+
+
+@pytest.mark.parametrize(
     ("rows", "told"),
     [
         ("0 1 2 3\n1 1 2 3\n", r"stamp_offset_s = 17\d+\.\d+` under \[truth\]"),
         ("0 1 2 3 4\n", "5 cells; expected `t x y z qx qy qz qw`"),
-        ("t,px,py,pz\n0,1,2,3\n", r"no columns x, y, z .* `position = \[...\]` under"),
+        (
+            "t,east,north,up\n0,1,2,3\n",
+            "no columns x, y, z .* `position = ",
+        ),
         ("0 nan nan nan\n", "none of its 1 rows can be used"),
     ],
 )

@@ -127,6 +127,23 @@ def test_a_reference_in_north_east_down_is_named(turned, is_named):
     assert all('`world = "ned"` under [truth]' in one.line for one in found)
 
 
+@pytest.mark.parametrize(
+    ("scale", "late_s", "line"),
+    [
+        (1000.0, 0.0, "`scale = 0.001` under [truth]"),
+        (1.0, 3.0, "`stamp_offset_s = -3"),
+        (1.0, 0.0, ""),
+    ],
+)
+def test_a_reference_in_another_unit_or_of_a_late_clock_is_named(scale, late_s, line):
+    run = truth_of(observed(), scale * np.eye(3))
+    late_ns = run.truth.stamps_ns + round(late_s * 1e9)
+    run = replace(run, truth=replace(run.truth, stamps_ns=late_ns))
+    found = [one for one in acting(run) if one.quantity.startswith("reference")]
+    assert len(found) == (line != "")
+    assert all(line in one.line for one in found)
+
+
 @pytest.mark.parametrize(("sigma_m_s", "is_named"), [(10.0, True), (0.5, False)])
 def test_a_stated_noise_of_velocities_in_another_unit_is_named(sigma_m_s, is_named):
     run = observed()
@@ -162,6 +179,14 @@ def test_a_depth_that_jumps_is_named_of_a_level_vehicle_too(step_m, is_named):
     depth = Depth(run.imu.stamps_ns[::10], z_m, unstated(len(z_m)))
     found = grave(replace(run, depth=depth))
     assert ["by 1 m at 31" in one.cause for one in found] == [True] * is_named
+
+
+def test_a_depth_in_steps_of_its_resolution_does_not_jump():
+    """It drifts with the tide while the vehicle keeps its height."""
+    run = level_drive(0)
+    z_m = np.round((0.003 * T + 0.02 * NOISE[:, 0])[::10], 1)
+    depth = Depth(run.imu.stamps_ns[::10], z_m, unstated(len(z_m)))
+    assert not grave(replace(run, depth=depth))
 
 
 def paused(signal: np.ndarray, begin_s: float) -> np.ndarray:

@@ -14,6 +14,7 @@ of fields, and with the keys of `CsvForm`. What stands before the first table ho
     rotation = "frd"
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -239,7 +240,10 @@ def with_truth(
     >>> len(with_truth(world, Path("truth.tum")).truth) == len(world.truth)
     True
     """
-    stated = {k: v for k, v in (config or {}).items() if k not in ("topic", "type")}
+    stated = config or {}
+    # fields of messages are no columns
+    if stated.keys() & {"topic", "type"}:
+        stated = {}
     one = _role("truth", _columns_of_poses(CsvFile(path), stated), str(path))
     table = _table(one, {path.name: path}, str(path))
     adapter: Any = one.adapter
@@ -274,16 +278,33 @@ def _columns_of_poses(file: CsvFile, stated: Mapping[str, Any]) -> dict[str, Any
                 f"{file.path}, line {file.first_line}: {len(file.names)} cells; expected `t x y z qx qy qz qw` or "
                 "`t x y z`, or a header that names the columns"
             )
-    place = TUM_COLUMNS[1:4]
-    turn = TUM_COLUMNS[4:]
-    if "position" not in stated and not set(place) <= set(names):
+    times = (name for name in names if _TIME.fullmatch(name.lower()))
+    form["stamp"] = next(times, names[0])
+    if place := _axes(names, _PLACE, "xyz"):
+        form["position"] = place
+    elif "position" not in stated:
         raise LogError(
-            f"{file.path}: has no columns x, y, z but {', '.join(names)}; name those of the position, `position = [...]` "
-            "under [truth] in the log configuration (--log-config FILE)"
+            f"{file.path}: has no columns x, y, z but {', '.join(names)}; name them in the log configuration "
+            "(--log-config FILE): under [truth] `position = [...]`, and `orientation = [...]` with the columns of the "
+            "quaternion's x, y, z, w"
         )
-    form |= {"stamp": names[0], "position": list(place)}
-    has_turn = set(turn) <= set(names)
-    return form | ({"orientation": list(turn)} if has_turn else {}) | dict(stated)
+    if turn := _axes(names, _TURN, "xyzw"):
+        form["orientation"] = turn
+    return form | dict(stated)
+
+
+_TIME = re.compile(r"t|time|(time_?)?stamps?|secs?|seconds")
+_PLACE = re.compile(r"(?:[tp]|pos_?|position_?)?([xyz])(?:_m)?")
+_TURN = re.compile(r"(?:q|quat|orientation)_?([xyzw])")
+"""Usual names of columns of the time, of places, of quaternions."""
+
+
+def _axes(
+    names: tuple[str, ...], usual: re.Pattern[str], axes: str
+) -> list[str] | None:
+    """Columns along each axis by their usual names; None where one is missing."""
+    found = {axis[1]: name for name in names if (axis := usual.fullmatch(name.lower()))}
+    return [found[axis] for axis in axes] if set(axes) <= found.keys() else None
 
 
 def _left_out(role: str, dropped: Mapping[str, int]) -> list[str]:
