@@ -189,6 +189,7 @@ MOST_WILD = 0.1
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 BACKWARDS = -np.eye(3)
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 Corrected = tuple[Findings, Sequence]
 """Findings, and the sequence with their faults put right."""
 
@@ -414,7 +415,7 @@ class SensorCheck:
         is_explained = any(f.acts for f in [*self.axes, *self.tilting, *self.of_dvl])
         if is_explained or not (unlike := unlike_pair(self.right)):
             return False
-        self.of_dvl.append(unlike)
+        self.of_dvl.append(sense_of_pair(self.right) or unlike)
         self.lever = []
         return True
 
@@ -909,6 +910,27 @@ def reversed_dvl(
     names = ", ".join(signed_axes(axes))
     cause = f"changes of {' and '.join(against)} are as velocities about the axes ({names}) would have them"
     return dvl_axes_finding(axes, cause, right), axes
+
+
+def sense_of_pair(right: Sequence) -> Finding | None:
+    """Axes of a Doppler log that accelerometers and depths contradict, with which it fits both; None without such axes."""
+    motion = BodyMotion.of(right)
+    if motion is None:
+        return None
+    of_depth = {DEPTH: DEPTH.compare(right, motion)}
+    if not names_of_opposite(of_depth, (DEPTH,)):
+        return None
+    fits = [
+        axes
+        for axes in (UPSIDE_DOWN, Z_NEGATED)
+        if unlike_pair(turned_dvl(right, axes)) is None
+    ]
+    if not fits:
+        return None
+    names = " or ".join(f"({', '.join(signed_axes(axes))})" for axes in fits)
+    cause = f"changes of depth and accelerations are as velocities about the axes {names} would have them"
+    found = [dvl_axes_finding(axes, cause, right) for axes in fits]
+    return replace(found[0], line="; or ".join(one.line for one in found))
 
 
 def of_heading_alone(found: Finding, right: Sequence, dvl_yaw: Estimate1D) -> Finding:

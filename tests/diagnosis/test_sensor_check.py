@@ -13,7 +13,7 @@ from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_units
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.vehicle_setup import unplaced
-from sonar_graph.measurements import Floats, Imu
+from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.navigation.alignment import Estimate1D, InitialTilt
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
@@ -22,8 +22,10 @@ from .runs import (
     acting,
     by_name,
     dvl_rows,
+    grave,
     heading_rows,
     late,
+    level_vehicle,
     line_of,
     names,
     recalibrated,
@@ -456,3 +458,24 @@ def test_a_vehicle_that_begins_to_turn_is_not_wild_and_a_single_row_is() -> None
     assert np.flatnonzero(sensor_check.are_wild(steady)).tolist() == [8, 9, 19]
     velocity[4] += [0.0, -1.5, 0.4]
     assert np.flatnonzero(sensor_check.are_wild(velocity)).tolist() == [4]
+
+
+@pytest.mark.parametrize("sense", [(1, 1, 1), (1, 1, -1), (1, -1, -1)])
+def test_a_slow_log_that_is_upside_down_is_named_by_the_depths(sense):
+    """A velocity a second of a vehicle that dives: accelerations show that it is wrong, depths in which sense."""
+    t = np.arange(0.0, 60.0, 0.02)
+    climb_m_s = 0.7 * np.sin(2 * np.pi * t / 35.0)
+    level_m_s = [0.05 + 0.02 * np.sin(0.2 * t), 0.02 * np.sin(0.15 * t + 1.0)]
+    run = level_vehicle(
+        np.column_stack([*level_m_s, climb_m_s]), 0.1 * np.sin(0.12 * t), 0
+    )
+    run = replace(run, dvl=run.dvl.rows(slice(0, None, 5)))
+    stamps_ns = run.imu.stamps_ns[::10]
+    noise_m = 0.005 * np.random.default_rng(1).standard_normal(len(stamps_ns))
+    z_m = (np.cumsum(climb_m_s) * 0.02 - 20.0)[::10] + noise_m
+    run = replace(run, depth=Depth(stamps_ns, z_m, np.full(len(z_m), 1e-4)))
+    found = grave(spoilt(run, "dvl", velocity=run.dvl.velocity * sense))
+    assert names(found) == ["DVL axes"] * (sense != (1, 1, 1))
+    # it hardly moves sideways, so that both fit
+    assert all('`rotation = ["x", "y", "-z"]`' in one.line for one in found)
+    assert all("`dvl.mounting.rpy_rad = [3.1416" in one.line for one in found)
