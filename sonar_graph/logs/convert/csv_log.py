@@ -250,7 +250,8 @@ def with_truth(
     truth, dropped = adapter.read(table, Setup())
     if truth is None:
         raise _useless(table, one.role, dropped)
-    first_ns, last_ns = truth.stamps_ns[[0, -1]].tolist()
+    first_ns = int(truth.stamps_ns[0])
+    last_ns = int(truth.stamps_ns[-1])
     if last_ns < sequence.start_ns or first_ns > sequence.end_ns:
         raise LogError(
             f"{path}: its poses are from {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, the log from "
