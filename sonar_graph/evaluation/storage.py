@@ -41,6 +41,7 @@ from sonar_graph.evaluation.results import (
 )
 from sonar_graph.files import (
     COMPARISON,
+    as_path,
     read_json,
     regular,
     replacing,
@@ -256,7 +257,7 @@ def write_viewer_files(comparison: Comparison, folder: Path) -> None:
         )
 
 
-def read_comparison(folder: Path) -> Comparison:
+def read_comparison(folder: str | Path) -> Comparison:
     """The comparison in a folder. Its sequence has start, end, truth and notes, but not the measurements.
 
     Raises
@@ -276,6 +277,7 @@ def read_comparison(folder: Path) -> Comparison:
     ...     [run.estimator for run in read_comparison(Path(folder)).runs]
     ['dead-reckoning']
     """
+    folder = as_path(folder, "read_comparison(folder)")
     if not (folder / INDEX).is_file():
         raise EvaluationError(
             f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to"

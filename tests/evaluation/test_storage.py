@@ -54,7 +54,7 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
 
 
 def test_reading_returns_what_was_written(comparison, folder):
-    restored = read_comparison(folder)
+    restored = read_comparison(str(folder))
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
         assert_same(getattr(comparison, name), getattr(restored, name), name)
     names = "name notes truth true_landmarks detections start_ns end_ns"
