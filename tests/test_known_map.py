@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import UNKNOWN_HEIGHT, Calibration, KnownMap, Start
-from sonar_graph.diagnosis.start_place import map_findings
+from sonar_graph.diagnosis.truth_check import map_findings
 from sonar_graph.errors import CalibrationError, LogError, SettingError
 from sonar_graph.estimator import known_map_of
 from sonar_graph.evaluation import compare

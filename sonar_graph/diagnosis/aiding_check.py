@@ -54,9 +54,13 @@ from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.sightings import SightingChanges, sighting_changes
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
+    FAR_MISFIT,
+    LAGS_S,
+    NO_LAG,
     Match,
     Values,
     explained,
+    far_lags,
     match,
     root_mean_square,
 )
@@ -69,6 +73,7 @@ from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import (
     NS_PER_S,
     UNMEASURED_M2,
+    Depth,
     Floats,
     Ints,
     PositionFixes,
@@ -297,7 +302,9 @@ def sighting_match(
         if changes is None:
             return None
         # only turns show a delay: ranges change evenly
-        fits.append((changes, match([changes.azimuth], find_lag=not of_range)))
+        fits.append(
+            (changes, match([changes.azimuth], lags_s=NO_LAG if of_range else LAGS_S))
+        )
     # a landmark's place depends on its azimuth: a mirrored one is more than a gain of -1
     is_mirrored = fits[1][1].scatter < fits[0][1].scatter / CLEARLY_BETTER
     changes, by_azimuth = fits[is_mirrored]
@@ -315,7 +322,7 @@ def range_match(changes: SightingChanges, aperture_rad: float) -> Match:
     Elevations are not measured, but lie within the aperture, with a sigma of ``aperture / sqrt(12)``.
     """
     whole = changes.range
-    found = replace(match([whole], find_lag=False), stretches=(whole,))
+    found = replace(match([whole], lags_s=NO_LAG), stretches=(whole,))
     of_elevation = aperture_rad / np.sqrt(12.0) * changes.error_by_elevation
     by_scale = explained(found.stretches, of_scale, 1)
     if by_scale is None or not found.gain.is_known:
@@ -406,15 +413,6 @@ POSITIONS = Check(
     causes=(OF_FIXES,),
     step_unit="m",
 )
-REFERENCE = replace(
-    POSITIONS,
-    name="reference",
-    role="truth",
-    quantity="reference: path over that by gyros and Doppler log",
-    units=LENGTHS,
-    other_lines={},
-)
-"""True positions, which are compared in unit, sense and delay alone."""
 SIGHTINGS = partial(Check, role="detections", against="the motion between frames")
 RANGE = SIGHTINGS(
     name="ranges to landmarks",
@@ -574,6 +572,26 @@ class SensorComparison:
             unused(self.check.role),
         )
 
+    def of_other_clock(self) -> Finding | None:
+        """Changes that are the reference's at another time."""
+        found = self.found
+        is_near = found.scatter < LARGEST_SCATTER * self.sigma
+        is_alike = is_near and found.misfit < FAR_MISFIT and not found.is_mirrored
+        # turned about, a way there and back is its own beginning
+        if (is_alike and found.gain.value > 0.0) or self.check.is_sighting:
+            return None
+        lags = far_lags(found)
+        if not lags:
+            return None
+        shifts = [shift_line(self.check.role, self.config, -lag.value) for lag in lags]
+        return contradiction(
+            f"{self.check.name} against {self.check.against}: delay",
+            "it agrees at another time only: another clock, such as GPS time, 18 s before UTC, or TAI, 37 s?",
+            "; or ".join(shifts),
+            lags[0],
+            "s",
+        )
+
     def pauses(self) -> Finding | None:
         """No change for a part of the log, of a sensor that follows its reference else."""
         if not self.found.gain.value > HARDLY:
@@ -723,6 +741,7 @@ FAULTS = (
     SensorComparison.stuck,
     SensorComparison.pauses,
     SensorComparison.jumps,
+    SensorComparison.of_other_clock,
     SensorComparison.opposite,
     SensorComparison.of_cause,
     SensorComparison.other_unit,
@@ -766,7 +785,7 @@ def vertical_bias(
     rows = motion.stretches(t, drift_rad, lambda seconds: seconds)
     duration_s = sum(float(np.ptp(part.seconds)) for part in rows)
     if rows and duration_s > LEAST_BIAS_S:
-        found = match(rows, find_lag=False)
+        found = match(rows, lags_s=NO_LAG)
         # a slow wave of the heading looks like a bias: as if all of its scatter were one in each stretch
         slope = 2.0 * found.scatter * np.sqrt(len(rows)) / duration_s
         bias = replace(found.gain, sigma=max(found.gain.sigma, slope, 1e-9))
@@ -844,18 +863,10 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
     has_height = fixes.are_sound() & ~are_unmeasured(fixes)[:, 2]
     if not has_height.any():
         return
-    fixes = fixes.rows(has_height)
-    by_depth = np.interp(
-        fixes.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan
-    )
-    off = fixes.position_m[:, 2] - by_depth
-    off = off[np.isfinite(off)]
-    if len(off) < NEAR_START:
+    off = height_over(depth, fixes.rows(has_height), fix_sigma_m(sequence)[2])
+    if off is None:
         return
-    off_m = float(np.median(off))
-    sigma_m = max(fix_sigma_m(sequence)[2], float(np.median(np.abs(off - off_m))))
-    if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
-        return
+    off_m = off.value
     of_fixes = origin_line(config, (0.0, 0.0, off_m), 2)
     if "log.origin" in sequence.notes:
         of_fixes = f"an `origin_deg_m` that is {off_m:+.2f} m higher, in geodetic under [positions] {IN_LOG_CONFIG}"
@@ -865,7 +876,25 @@ def fix_height_findings(sequence: Sequence, config: LogConfig) -> Iterator[Findi
         cause = "the depths begin at the stated start: only the heights of the fixes are wrong, of another origin or sign"
         line = of_fixes
     quantity = "depth: height of the position fixes over it"
-    yield contradiction(quantity, cause, line, Estimate1D(off_m, sigma_m), "m")
+    yield contradiction(quantity, cause, line, off, "m")
+
+
+def height_over(
+    depth: Depth, known: PositionFixes, sigma_m: float
+) -> Estimate1D | None:
+    """Typical height of positions over that of the depths, beyond doubt; None where they agree, or are few."""
+    by_depth = np.interp(
+        known.stamps_ns, depth.stamps_ns, depth.z_m, left=np.nan, right=np.nan
+    )
+    off = known.position_m[:, 2] - by_depth
+    off = off[np.isfinite(off)]
+    if len(off) < NEAR_START:
+        return None
+    off_m = float(np.median(off))
+    sigma_m = max(sigma_m, float(np.median(np.abs(off - off_m))))
+    if abs(off_m) <= FARTHEST_FROM_START_M + ACTING_SIGMAS * sigma_m:
+        return None
+    return Estimate1D(off_m, sigma_m)
 
 
 def origin_line(config: LogConfig, off_m: ArrayLike, digits: int) -> str:
@@ -1016,11 +1045,14 @@ def heading_turn(
     starts_so = right.calibration.start.states("rpy_rad") and not any(
         start_heading_findings(right, motion)
     )
-    of_fixes = f"; or {unused('positions')}, whose world is turned: the stated start agrees with the heading"
+    of_known = f"{unused('positions')}, whose world is turned"
+    if right.positions is None:
+        of_known = "read the aligned errors, since the truth's world is turned"
+    of_known = f"; or {of_known}: the stated start agrees with the heading"
     yield replace(
         row,
         cause=f"{first}{sense}either its world, north or mounting is another",
-        line=f"{of_sense}`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}{of_fixes if starts_so else ''}"
+        line=f"{of_sense}`yaw_offset_rad = {offset:.3f}` under [heading] {IN_LOG_CONFIG}{of_known if starts_so else ''}"
         f"{OR_DVL} is turned on the vehicle: `dvl.mounting.rpy_rad = {numbers(rpy, 4)}` {IN_CALIBRATION}",
         gravity=gravity_of(abs(angle.value) > large_rad),
     )
@@ -1041,7 +1073,7 @@ def course_angle(
     path = np.append(0.0, np.cumsum(steps))
     t = motion.since_origin(known.stamps_ns)
     level = places @ [1.0, 1j, 0.0]
-    turn = match(motion.stretches(t, level, motion.reference(path)), find_lag=False)
+    turn = match(motion.stretches(t, level, motion.reference(path)), lags_s=NO_LAG)
     reason = "too little motion beside positions"
     # north and east exchanged are a fault of the positions; a way that fits badly has no direction
     is_way = not turn.is_mirrored and turn.misfit < MOST_MISFIT

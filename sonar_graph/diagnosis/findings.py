@@ -212,7 +212,9 @@ def said_once(findings: Findings) -> Findings:
 
 def numbers(values: Iterable[float], digits: int) -> str:
     """A list of numbers as TOML has it."""
-    return f"[{', '.join(f'{value:.{digits}f}' for value in values)}]"
+    # + 0.0 takes the sign off a zero
+    rounded = (round(float(value), digits) + 0.0 for value in values)
+    return f"[{', '.join(f'{value:.{digits}f}' for value in rounded)}]"
 
 
 def signed_axes(P: np.ndarray) -> list[str]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Start
@@ -27,14 +26,11 @@ from sonar_graph.diagnosis.aiding_check import (
     OTHER_UNIT,
     POSITIONS,
     RANGE,
-    REFERENCE,
     VERTICAL_BIAS,
     Check,
-    SensorComparison,
     begins_below_water,
     findings_of,
     fix_height_findings,
-    fix_match,
     heading_findings,
     position_findings,
     start_depth_findings,
@@ -70,7 +66,6 @@ from sonar_graph.diagnosis.findings import (
     matters,
     notes_of,
     numbers,
-    other_world,
     scale_line,
     shift_line,
     signed_axes,
@@ -80,7 +75,13 @@ from sonar_graph.diagnosis.findings import (
     worst_first,
 )
 from sonar_graph.diagnosis.motion_signals import BodyMotion
-from sonar_graph.diagnosis.signals import CLEARLY_BETTER, Match, weighted
+from sonar_graph.diagnosis.signals import (
+    CLEARLY_BETTER,
+    MOST_WILD,
+    Match,
+    are_wild,
+    weighted,
+)
 from sonar_graph.diagnosis.start import (
     ARM,
     LARGE_TURN_RAD,
@@ -101,9 +102,9 @@ from sonar_graph.diagnosis.start import (
     with_fitted,
     without_bias,
 )
-from sonar_graph.diagnosis.start_place import (
-    FROM_TRUTH,
+from sonar_graph.diagnosis.truth_check import (
     map_findings,
+    reference_faults,
     start_place_findings,
 )
 from sonar_graph.diagnosis.turn_rate import scaled_gyros, turn_rate_finding
@@ -127,7 +128,7 @@ from sonar_graph.logs import (
     stuck_quantities,
 )
 from sonar_graph.logs.adapters import LogConfig, axes_matrix
-from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu, PositionFixes
+from sonar_graph.measurements import NS_PER_S, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import (
     DvlMatch,
     Estimate1D,
@@ -182,10 +183,6 @@ MOST_SHARE_OF_DELAY = 1.5
 """Share of a late IMU's delay that depths, sightings and fixes show."""
 LEAST_SPEED_SIGMAS = 10.0
 """Level speed over the noise of a good Doppler log, from which on its slow errors are no bias of the gyros."""
-WILD = 5.0
-"""Median deviations from the rows about it, three to four sigmas, beyond which a velocity may be wild."""
-MOST_WILD = 0.1
-"""Share of velocities up to which wild ones are single wrong rows."""
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 Z_NEGATED = np.diag([1.0, 1.0, -1.0])
 BACKWARDS = -np.eye(3)
@@ -227,7 +224,7 @@ def of_usable_velocities(sequence: Sequence) -> Sequence:
     if not whole.any():
         return sequence
     dvl = sequence.dvl.rows(whole)
-    is_wild = are_wild(dvl.velocity)
+    is_wild = are_wild(dvl.velocity, BEST_NOISE_M_S)
     if 0.0 < is_wild.mean() <= MOST_WILD:
         usual_ns = dvl.stamps_ns[~is_wild]
         velocity = dvl.velocity.copy()
@@ -235,43 +232,6 @@ def of_usable_velocities(sequence: Sequence) -> Sequence:
             axis[is_wild] = np.interp(dvl.stamps_ns[is_wild], usual_ns, axis[~is_wild])
         dvl = replace(dvl, velocity=velocity)
     return replace(sequence, dvl=dvl)
-
-
-def are_wild(velocity: Floats) -> NDArray[np.bool_]:
-    """Rows far from the median of five about them, shape (n,): Hampel's filter.
-
-    The scale is the median deviation of the five, or that of all rows where it is larger: rows at rest agree by chance.
-    A wild row is also nearer to neither neighbour than they are to each other: a vehicle that begins to turn is not wild.
-    The second time wild rows are as the median, so that of two beside each other both are found.
-    """
-    steady = velocity.copy()
-    is_wild = np.zeros(len(velocity), dtype=np.bool_)
-    for _ in range(2):
-        found, middle = wild_rows(steady)
-        steady[found] = middle[found]
-        is_wild |= found
-    return is_wild
-
-
-def wild_rows(velocity: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Rows that are wild beside their neighbours, shape (n,), and the medians of five, shape (n, 3)."""
-    padded = np.pad(velocity, ((2, 2), (0, 0)), mode="reflect")
-    five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)  # (n, 3, 5)
-    middle = np.median(five, axis=2)
-    off = np.abs(velocity - middle)
-    scatter = np.median(np.abs(five - middle[:, :, None]), axis=2)
-    usual = np.median(off, axis=0)
-    scale = np.maximum(np.maximum(scatter, usual), BEST_NOISE_M_S)
-    is_far = np.linalg.norm(off / scale, axis=1) > WILD
-    beside = np.pad(velocity, ((1, 1), (0, 0)), mode="reflect")
-    before = beside[:-2]
-    after = beside[2:]
-    nearest = np.minimum(
-        np.linalg.norm(velocity - before, axis=1),
-        np.linalg.norm(velocity - after, axis=1),
-    )
-    is_alone = nearest > np.linalg.norm(after - before, axis=1)
-    return is_far & is_alone, np.asarray(middle)
 
 
 def compared(sequence: Sequence, config: LogConfig | None = None) -> Sequence:
@@ -422,6 +382,7 @@ class SensorCheck:
     def compare_others(self) -> bool:
         """Bias of the gyros, and all other sensors with the motion by IMU and Doppler log."""
         tilt = find_start_tilt(self.right)
+        self.find_faults_of_reference(tilt)
         right, estimates = self.find_bias(tilt)
         self.by_motion = [
             of_heading_alone(f, right, self.match.turn[2])
@@ -431,10 +392,7 @@ class SensorCheck:
         ]
         self.join_vertical_bias()
         self.doubt_arm()
-        self.reference = list(reference_findings(right, self.config, tilt))
-        # a truth in another unit or of other axes begins elsewhere too
-        if any(f.quantity == REFERENCE.quantity for f in self.reference):
-            self.by_motion = [f for f in self.by_motion if f.quantity != FROM_TRUTH]
+        self.reference += reference_findings(right, self.config, tilt)
         start = right.calibration.start
         if start.states("rpy_rad"):
             off = tilt.angle(1).minus(start.rpy_rad[1])
@@ -452,6 +410,18 @@ class SensorCheck:
         self.explain_delays()
         self.leave_out_consequences()
         return False
+
+    def find_faults_of_reference(self, tilt: StartTilt) -> None:
+        """Faults of the truth, which is then compared with nothing else."""
+        if self.right.truth is None:
+            return
+        alone = self.right
+        self.right = replace(alone, truth=None)
+        unbiased, _ = self.find_bias(tilt)
+        as_before = replace(unbiased, truth=alone.truth)
+        self.reference = list(reference_faults(as_before, self.config))
+        if not self.reference:
+            self.right = alone
 
     def find_bias(self, tilt: StartTilt) -> tuple[Sequence, Estimates3D]:
         """Rows on the bias of the gyros; the sequence with the bias that they state, and what is left of it."""
@@ -1143,9 +1113,7 @@ def reference_findings(
     """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
     reference = right.true_poses
-    of_path = list(reference_path_findings(right, config))
-    yield from of_path
-    if reference is None or of_path:
+    if reference is None:
         yield from tilt_findings(tilt, right.calibration, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, reference, right.calibration)
@@ -1170,42 +1138,6 @@ def reference_findings(
     yield from of_heading
 
 
-def reference_path_findings(sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
-    """A reference whose level path is that by gyros and Doppler log mirrored, in another unit or late; nothing if right."""
-    motion = BodyMotion.of(sequence)
-    truth = sequence.truth
-    if motion is None or truth is None:
-        return
-    unknown_m2 = np.full((len(truth), 3, 3), np.nan)
-    places = PositionFixes(truth.stamps_ns, truth.positions, unknown_m2)
-    found = fix_match(replace(sequence, positions=places), motion)
-    if found is None or not found.gain.is_known or found.misfit >= MOST_MISFIT:
-        return
-    if not found.is_mirrored:
-        one = SensorComparison(
-            REFERENCE, REFERENCE.quantity, found, LEAST_LATE_M, sequence, config
-        )
-        unit = one.other_unit() if one.units else None
-        delay = one.delay()
-        if unit is not None:
-            yield unit
-        # to two seconds orientations show it better
-        elif delay.acts and (
-            sequence.true_poses is None or abs(delay.estimate.value) > LATE_S
-        ):
-            yield delay
-        return
-    yield contradiction(
-        REFERENCE.quantity,
-        "it is its mirror image: north, east, down instead of east, north, up; all errors are of that",
-        f'{other_world(config, "truth")}, and `rotation = "frd"` where its orientations are of a body with z down; or the '
-        "fields of position in another order",
-        replace(found.gain, value=-abs(found.gain.value)),
-    )
-
-
-LEAST_LATE_M = 0.3
-LATE_S = 1.8
 FEWEST_STATED = 20
 LARGEST_STATED = 20.0
 """Stated sigma of velocities over their scatter from row to row, from which on it is in another unit."""

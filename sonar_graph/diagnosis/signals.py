@@ -27,6 +27,15 @@ from sonar_graph.navigation.alignment import Estimate1D
 
 Values = NDArray[np.floating | np.complexfloating]
 LAGS_S = np.arange(-4.0, 4.01, 0.25)
+FAR_LAGS_S = np.arange(-120.0, 120.01, 0.5)
+"""Of a sensor on another clock, such as GPS time without its leap seconds."""
+NO_LAG = np.zeros(1)
+FAR_ROWS = 600
+FAR_MISFIT = 0.05
+FAR_GAIN = 0.1
+FAR_APART_S = 5.0
+FAR_SHARE = 0.3
+"""Of the log."""
 BLOCKS = (12, 6)
 """Numbers of blocks of a stretch; the larger variance counts."""
 FEWEST_ROWS = 8
@@ -42,6 +51,10 @@ CLEARLY_BETTER = 1.5
 BEYOND_DOUBT = 10.0
 """Sigmas of a cause from which on `A_PART` of what is left over need be its own: a slow vehicle's noise hides it."""
 A_PART = 1.2
+WILD = 5.0
+"""Median deviations from the rows about it, three to four sigmas, beyond which a row may be wild."""
+MOST_WILD = 0.1
+"""Share of rows up to which wild ones are single wrong rows."""
 STEP_ROWS = 3
 STEP_SIGMAS = 10.0
 """Far beyond the largest of a long log's differences by noise, also where it has heavy tails."""
@@ -77,6 +90,11 @@ class SignalStretch:
     def excess(self) -> "SignalStretch":
         """What the sensor has beyond its reference, ``y - x``, as a signal of its own."""
         return replace(self, y=self.y - self.x)
+
+    def thinned(self, most: int) -> "SignalStretch":
+        """The same with so many rows, or a few more."""
+        every = max(1, len(self.seconds) // most)
+        return replace(self, seconds=self.seconds[::every], y=self.y[::every])
 
     def delayed(self, lag_s: float) -> "SignalStretch":
         """The same with a reference that comes later."""
@@ -239,14 +257,14 @@ class RobustFit:
 
 
 def match(
-    stretches: list[SignalStretch], drift_sigma: float = 0.0, *, find_lag: bool = True
+    stretches: list[SignalStretch], drift_sigma: float = 0.0, lags_s: Floats = LAGS_S
 ) -> Match:
     """Compare a sensor with its reference.
 
-    ``drift_sigma``: how fast the reference may drift, in its unit a second; 0: not at all.
+    ``drift_sigma``: how fast the reference may drift, in its unit a second; 0: not at all. ``lags_s``: those that are tried,
+    0 among them; `NO_LAG` where none is to be found.
     """
     is_plane = any(np.iscomplexobj(s.y) for s in stretches)
-    lags_s = LAGS_S if find_lag else np.zeros(1)
     squares = np.zeros((1 + is_plane, len(lags_s)))
     rows = np.zeros_like(squares)
     for stretch in stretches:
@@ -267,7 +285,31 @@ def match(
     # a vehicle that circles fits as well half a turn later
     if of_lags[best] * CLEARLY_BETTER > of_lags[now]:
         best = now
+    find_lag = len(lags_s) > 1
     return refined(stretches, drift_sigma, float(lags_s[best]), is_mirrored, find_lag)
+
+
+def far_lags(found: Match) -> list[Estimate1D]:
+    """Delays with which a sensor on another clock agrees with its reference, s, the best first; nothing without any.
+
+    Ways that repeat fit at several times, of which two are enough to see that the best is not sure.
+    """
+    thinned = [one.thinned(FAR_ROWS) for one in found.whole]
+    duration_s = max((float(np.ptp(one.seconds)) for one in found.whole), default=0.0)
+    # most rows must have a reference then
+    lags_s = FAR_LAGS_S[np.abs(FAR_LAGS_S) < FAR_SHARE * duration_s]
+    fitting = list[Estimate1D]()
+    limit = found.scatter / CLEARLY_BETTER**2
+    while len(lags_s) and len(fitting) < 2:
+        far = match(thinned, lags_s=lags_s)
+        is_alike = not far.is_mirrored and far.misfit < FAR_MISFIT
+        is_right = is_alike and abs(far.gain.value - 1.0) < FAR_GAIN
+        if not (is_right and far.scatter < limit):
+            break
+        fitting.append(far.lag)
+        lags_s = lags_s[np.abs(lags_s - far.lag.value) > FAR_APART_S]
+        limit = far.scatter * CLEARLY_BETTER**2
+    return fitting
 
 
 def refined(
@@ -426,6 +468,44 @@ def steps(
             return []
         size[max(k - 3 * STEP_ROWS, 0) : k + 3 * STEP_ROWS] = 0.0
     return sorted(found)
+
+
+def are_wild(rows: Floats, least: float) -> NDArray[np.bool_]:
+    """Rows, shape (n, 3), far from the median of five about them, shape (n,): Hampel's filter.
+
+    The scale is the median deviation of the five, or that of all rows or ``least`` where these are larger: rows at rest
+    agree by chance. A wild row is also nearer to neither neighbour than they are to each other: a vehicle that begins to
+    turn is not wild.
+    The second time wild rows are as the median, so that of two beside each other both are found.
+    """
+    steady = rows.copy()
+    is_wild = np.zeros(len(rows), dtype=np.bool_)
+    for _ in range(2):
+        found, middle = wild_rows(steady, least)
+        steady[found] = middle[found]
+        is_wild |= found
+    return is_wild
+
+
+def wild_rows(rows: Floats, least: float) -> tuple[NDArray[np.bool_], Floats]:
+    """Rows that are wild beside their neighbours, shape (n,), and the medians of five, shape (n, 3)."""
+    padded = np.pad(rows, ((2, 2), (0, 0)), mode="reflect")
+    five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)  # (n, 3, 5)
+    middle = np.median(five, axis=2)
+    off = np.abs(rows - middle)
+    scatter = np.median(np.abs(five - middle[:, :, None]), axis=2)
+    usual = np.median(off, axis=0)
+    scale = np.maximum(np.maximum(scatter, usual), least)
+    is_far = np.linalg.norm(off / scale, axis=1) > WILD
+    beside = np.pad(rows, ((1, 1), (0, 0)), mode="reflect")
+    before = beside[:-2]
+    after = beside[2:]
+    nearest = np.minimum(
+        np.linalg.norm(rows - before, axis=1),
+        np.linalg.norm(rows - after, axis=1),
+    )
+    is_alone = nearest > np.linalg.norm(after - before, axis=1)
+    return is_far & is_alone, np.asarray(middle)
 
 
 def resolution(y: Values) -> float:

@@ -25,6 +25,7 @@ from sonar_graph.diagnosis.findings import (
 from sonar_graph.diagnosis.motion_signals import UP_OVER_S, BodyMotion
 from sonar_graph.diagnosis.signals import (
     CLEARLY_BETTER,
+    NO_LAG,
     Match,
     match,
     root_mean_square,
@@ -207,7 +208,7 @@ def gain_along(
     y = np.sum(by_sensor * direction, axis=1)
     x = y + np.sum(r * direction, axis=1)
     rows = motion.stretches(t, y, lambda at: np.interp(at, t, x))
-    return match(rows, find_lag=False)
+    return match(rows, lags_s=NO_LAG)
 
 
 def residual(motion: BodyMotion, gravity_m_s2: Floats) -> Floats:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis import Finding, check_sensors, sensor_check
 from sonar_graph.diagnosis.findings import Gravity
+from sonar_graph.diagnosis.signals import are_wild
 from sonar_graph.diagnosis.start import StartTilt, find_start_tilt
 from sonar_graph.diagnosis.units import coarse_findings, range_changes, wrong_units
 from sonar_graph.logs.adapters import LogConfig
@@ -451,13 +452,13 @@ def test_a_vehicle_that_begins_to_turn_is_not_wild_and_a_single_row_is() -> None
             [1.58, 0.492, 0.018],
         ]
     )
-    assert not sensor_check.are_wild(velocity).any()
+    assert not are_wild(velocity, 0.01).any()
     steady = np.full((20, 3), [0.5, 0.05, -0.1])
     steady[8:10] = [[0.6, -1.9, 1.7], [-2.2, 0.3, -1.5]]
     steady[-1] = [0.75, 0.17, 2.0]
-    assert np.flatnonzero(sensor_check.are_wild(steady)).tolist() == [8, 9, 19]
+    assert np.flatnonzero(are_wild(steady, 0.01)).tolist() == [8, 9, 19]
     velocity[4] += [0.0, -1.5, 0.4]
-    assert np.flatnonzero(sensor_check.are_wild(velocity)).tolist() == [4]
+    assert np.flatnonzero(are_wild(velocity, 0.01)).tolist() == [4]
 
 
 @pytest.mark.parametrize("sense", [(1, 1, 1), (1, 1, -1), (1, -1, -1)])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.diagnosis.signals import (
+    NO_LAG,
     SMALL_SAMPLE,
     RobustFit,
     SignalStretch,
@@ -135,7 +136,7 @@ def test_a_reference_that_is_known_nowhere_gives_no_warning():
     at_rows = SignalStretch(
         T, wave(T), lambda at: np.where(np.isin(at, T), wave(at), np.nan)
     )
-    found = match([at_rows], find_lag=False)
+    found = match([at_rows], lags_s=NO_LAG)
     assert found.gain.value == pytest.approx(1.0)
     assert np.isnan(found.rate)
 
