@@ -50,12 +50,12 @@ def oriented(
 ) -> Entry:
     """IMU messages with an orientation and the first and last variance of it."""
     row = {
+        "angular_velocity": vector(0, 0, 0),
         "linear_acceleration": vector(0, 0, 9.8),
         "orientation": quaternion(rotation),
         "orientation_covariance": [first, 0, 0, 0, 0.01, 0, 0, 0, variance],
     }
-    rows = [row] * 2
-    return rows_of(topic, IMU, rows, "imu_link", angular_velocity=vector(0, 0, 0))
+    return rows_of(topic, IMU, [row] * 2, "imu_link")
 
 
 def fix(north_m: float = 0.0, **other: Any) -> dict[str, Any]:
@@ -80,6 +80,16 @@ def points(*places: tuple[float, float, float], topic: str = "/usbl/point") -> E
 def pressures(*values: float) -> Entry:
     rows = [{"fluid_pressure": value} for value in values]
     return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=0.0)
+
+
+def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
+    turns = [quaternion(Rotation.from_euler("z", yaw)) for yaw in yaws_rad]
+    poses = [
+        {"position": vector(step_m * row, 0, 0), "orientation": turn}
+        for row, turn in enumerate(turns)
+    ]
+    rows = [{"pose": {"pose": pose}} for pose in poses]
+    return rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", rows)
 
 
 YAW = Rotation.from_euler("z", 0.5)
@@ -137,6 +147,16 @@ CASES: dict[str, Case] = {
     "fixes in millimetres of a map grid in north-east-down": (
         [points((4.67e9, 5e8, 3000.0))], '[positions]\nworld = "ned"\nscale = 1e-3\norigin_m = [4.67e6, 499990.0, 1.0]',
         {"positions.position_m": [[10, 0, -2]]}, {}),
+    "a true orientation that never changes": (
+        [moving(0.3, 0.3, 0.3)], FRD_DVL, {}, {"log.warnings": "truth: its orientation is the same in all 3 messages, "
+         "although it moves by 2 m: if that is none, `orientation = false` under [truth]"}),
+    "a true orientation that changes": ([moving(0.3, 0.3, 0.4)], FRD_DVL, {}, {"log.warnings": None}),
+    "a true orientation of a vehicle that stays": (
+        [moving(0.3, 0.3, step_m=0.5)], FRD_DVL, {}, {"log.warnings": None}),
+    "a true orientation that is none": (
+        [moving(0.3, 0.3, 0.3)], FRD_DVL + "[truth]\norientation = false",
+        {"truth.positions": [[0, 0, 0], [1, 0, 0], [2, 0, 0]], "truth.quaternions_xyzw": np.full((3, 4), NAN)},
+        {"log.warnings": None}),
     "true positions of a total station": (
         [points((1, 2, 3), (1, 2, 4), topic="/ground_truth/point")], '[truth]\nworld = "ned"',
         {"truth.positions": [[2, 1, -3], [2, 1, -4]], "truth.quaternions_xyzw": np.full((2, 4), NAN)}, {}),
@@ -195,120 +215,53 @@ def test_of_several_orientations_that_of_the_imu_in_use_counts(foreign):
         sequence = foreign.read(*entries, topics={"imu": topic})
         assert sequence.heading.yaw_rad.tolist() == pytest.approx([yaw_rad] * 2)
         assert f"heading: {topic};" in sequence.notes["log.topics"] + ";"
-    with pytest.raises(
-        LogError, match=r"for heading, 2 topics fit: .*\[heading\] topic"
-    ):
-        foreign.read(
-            *entries[:2], imu_of("/imu/third"), dvl(), topics={"imu": "/imu/third"}
-        )
+    third = ("/imu/third", *imu()[1:])
+    message = r"for heading, 2 topics fit: .*\[heading\] topic"
+    with pytest.raises(LogError, match=message):
+        foreign.read(*entries, third, topics={"imu": "/imu/third"})
 
 
-def imu_of(topic: str) -> Entry:
-    return topic, *imu()[1:]
-
-
-def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(
-    foreign,
-):
+def test_what_is_called_truth_is_no_measurement_unless_it_is_chosen(foreign):
     """A NavSatFix of any other name is; and an inspection offers no truth as a Doppler log."""
     truth = fixes(fix(), fix(1.0), topic="/truth/fix")
     assert foreign.read(truth).positions is None
     assert len(foreign.read(truth, topics={"positions": "/truth/fix"}).positions) == 2
-    odometry = rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", [{}] * 2)
-    summary = inspect_log(foreign.write(imu(), odometry))
-    reasons = {role.role: role.reason for role in summary.roles}
-    assert "ground_truth" not in reasons["dvl"]
-    (offered,) = re.findall(r"\[dvl\](.*)\[depth\]", summary.toml, re.DOTALL)
-    assert "/ground_truth/odometry" not in offered
-    other = inspect_log(foreign.write(imu(), ("/odometry", *odometry[1:])))
-    reasons = {role.role: role.reason for role in other.roles}
-    assert "/odometry only if chosen" in reasons["dvl"]
+    for topic, is_offered in (("/ground_truth/odometry", False), ("/odometry", True)):
+        odometry = rows_of(topic, "nav_msgs/msg/Odometry", [{}] * 2)
+        summary = inspect_log(foreign.write(imu(), odometry))
+        reasons = {role.role: role.reason for role in summary.roles}
+        assert (f"{topic} only if chosen" in reasons["dvl"]) == is_offered
+        (offered,) = re.findall(r"\[dvl\](.*)\[depth\]", summary.toml, re.DOTALL)
+        assert (topic in offered) == is_offered
 
 
-def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:
-    rows = [
-        {
-            "pose": {
-                "pose": {
-                    "position": vector(step_m * i, 0, 0),
-                    "orientation": quaternion(Rotation.from_euler("z", y)),
-                }
-            }
-        }
-        for i, y in enumerate(yaws_rad)
-    ]
-    return rows_of("/ground_truth/odometry", "nav_msgs/msg/Odometry", rows)
-
-
-def test_a_constant_true_orientation_raises_a_doubt(
-    foreign,
-):
-    still = moving(0.3, 0.3, 0.3)
-    notes = foreign.read(still, toml=FRD_DVL).notes["log.warnings"]
-    assert (
-        "truth: its orientation is the same in all 3 messages, although it moves by 2 m: if that is none"
-        in notes
-    )
-    assert "`orientation = false` under [truth]" in notes
-    for sound in (moving(0.3, 0.3, 0.4), moving(0.3, 0.3, step_m=0.5)):
-        assert (
-            "orientation" not in foreign.read(sound, toml=FRD_DVL).notes["log.warnings"]
-        )
-    without = foreign.read(still, toml=f"{FRD_DVL}[truth]\norientation = false")
-    assert "orientation" not in without.notes["log.warnings"]
-    assert without.truth.positions.tolist() == [[0, 0, 0], [1, 0, 0], [2, 0, 0]]
-    assert not without.truth.has_orientation
-
-
-@pytest.mark.parametrize(
-    ("toml", "said"),
-    [
-        ('[heading]\ntype = "a/msg/B"', "give either orientation"),
-        ('[positions]\ntype = "a/msg/B"', "give either position"),
-    ],
-)
-def test_a_table_without_a_source_of_its_numbers_is_refused(foreign, toml, said):
-    with pytest.raises(LogError, match=said):
-        foreign.read(toml=toml)
-
-
-def aided(*, wrong: int = -1) -> list[Entry]:
-    """Heading of 2 rad and five fixes 3 m east of each other's first, of a vehicle at 1 m/s; one row may be wrong."""
-    yaws_rad = [2.0] * 5
-    places = [(3.0, 4.0, 0.5)] * 5
-    if wrong >= 0:
-        yaws_rad[wrong] = np.pi
-        places[wrong] = (900.0, 900.0, 0.0)
-    turns = [quaternion(Rotation.from_euler("z", yaw)) for yaw in yaws_rad]
-    rows = [{"quaternion": turn} for turn in turns]
-    headings = rows_of("/gps/heading", TURNED, rows)
-    return [headings, points(*places), dvl(velocity=vector(0, 0, 0)), imu()]
-
-
-ANTENNA = "[positions]\nantenna_m = [1.0, 0.0, 0.0]\n"
-
-
-@pytest.mark.parametrize("wrong", [-1, 0, 4])
+@pytest.mark.parametrize("wrong", [None, 0, 4])
 def test_an_unknown_start_is_that_of_the_first_headings_and_fixes(
     foreign, tmp_path, wrong
 ):
     """With three times their sigma, of a vehicle at rest; one wrong row does not count."""
+    yaws_rad = np.full(5, 2.0)
+    places = np.tile([3.0, 4.0, 0.5], (5, 1))
+    if wrong is not None:
+        yaws_rad[wrong] = np.pi
+        places[wrong] = 900.0
+    turns = map(quaternion, Rotation.from_euler("z", yaws_rad[:, None]))
+    headings = rows_of("/gps/heading", TURNED, [{"quaternion": turn} for turn in turns])
+    entries = [headings, points(*places.tolist()), dvl(velocity=vector(0, 0, 0)), imu()]
     calibration = tmp_path / "vehicle.toml"
-    calibration.write_text(ANTENNA)
-    sequence = foreign.read(*aided(wrong=wrong), calibration=calibration)
+    calibration.write_text("[positions]\nantenna_m = [1.0, 0.0, 0.0]\n")
+    sequence = foreign.read(*entries, calibration=calibration)
     start = sequence.calibration.start
-    assert start.rpy_rad == pytest.approx((0, 0, 2.0), abs=1e-4)
-    assert start.position_m == pytest.approx(
-        (3 - np.cos(2), 4 - np.sin(2), 0.5), abs=1e-4
-    )
-    assert start.rpy_sigma_rad == pytest.approx(
-        (0.1, 0.1, 3 * np.hypot(0.02, 0.05)), abs=1e-4
-    )
-    assert start.position_sigma_m[0] == pytest.approx(3 * 2.5, abs=1e-4)
-    assert (
-        "heading and position by the first headings and fixes: position_m = ["
-        in sequence.notes["log.start"]
-    )
+    antenna_m = np.array([np.cos(2), np.sin(2), 0])
+    for found, expected in (
+        (start.rpy_rad, (0, 0, 2)),
+        (start.position_m, (3, 4, 0.5) - antenna_m),
+        (start.rpy_sigma_rad, (0.1, 0.1, 3 * np.hypot(0.02, 0.05))),
+        (start.position_sigma_m[0], 3 * 2.5),
+    ):
+        assert found == pytest.approx(expected, abs=1e-4)
+    said = "heading and position by the first headings and fixes: position_m = ["
+    assert said in sequence.notes["log.start"]
 
 
 def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not():
@@ -323,9 +276,10 @@ def test_a_heading_that_counts_turns_is_in_rad_and_one_that_jumps_is_not():
     "said", [{"variance": 0.0}, {"first": -1.0}, {"variance": NAN}]
 )
 def test_an_orientation_that_says_no_variance_is_no_heading_and_is_named(foreign, said):
-    log = foreign.write(oriented(YAW, **said), dvl())
-    assert foreign.read(oriented(YAW, **said), dvl()).heading is None
-    (role,) = [role for role in inspect_log(log).roles if role.role == "heading"]
-    assert role.topic is None
-    assert "/imu says of no orientation that it is measured" in role.reason
-    assert "needs_variance = false" in role.reason
+    entries = oriented(YAW, **said), dvl()
+    assert foreign.read(*entries).heading is None
+    roles = {role.role: role for role in inspect_log(foreign.write(*entries)).roles}
+    assert roles["heading"].topic is None
+    reason = roles["heading"].reason
+    assert "/imu says of no orientation that it is measured" in reason
+    assert "needs_variance = false" in reason
