@@ -343,3 +343,7 @@ def flip(path: Path, at: int, bit: int = 4) -> None:
     content = bytearray(path.read_bytes())
     content[at] ^= bit
     path.write_bytes(content)
+
+
+def cut(path: Path, at: int) -> None:
+    path.write_bytes(path.read_bytes()[:at])
