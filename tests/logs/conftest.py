@@ -117,9 +117,9 @@ class Bench:
             "track": list(track),
         }
 
-    def basics(self, samples: int = 5) -> list[Entry]:
+    def basics(self, samples: int = 5, first_ns: int = T0_NS) -> list[Entry]:
         """The topics that every log needs."""
-        stamps = [T0_NS + i * 10**8 for i in range(samples)]
+        stamps = [first_ns + i * 10**8 for i in range(samples)]
         return [
             ("/imu", "imu", [self.imu(s) for s in stamps]),
             ("/dvl", "dvl", [self.dvl(s) for s in stamps]),
