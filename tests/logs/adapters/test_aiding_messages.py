@@ -108,90 +108,90 @@ rpy = ["position_covariance[1]", "position_covariance[2]", "position_covariance[
 # fmt: off
 CASES: dict[str, Case] = {
     "orientation that says its variance": (
-        [oriented(YAW), dvl()], "", {"heading.yaw_rad": [0.5] * 2, "heading.sigma_rad": [0.1] * 2}, {}),
+        [oriented(YAW), dvl()], "", {"heading.yaw_rad": [0.5] * 2, "heading.sigma_rad": [0.1] * 2}),
     "orientation of a turned IMU": (
         [oriented(YAW), dvl(), tree("imu_link", z=np.sin(0.1), w=np.cos(0.1))], "",
-        {"heading.yaw_rad": [0.3] * 2, "calibration.imu.mounting.rpy_rad": [0, 0, 0.2]}, {}),
+        {"heading.yaw_rad": [0.3] * 2, "calibration.imu.mounting.rpy_rad": [0, 0, 0.2]}),
     "orientation of an IMU on its side, by the rotation of the IMU": (
         [oriented(Rotation.from_euler("ZYX", [0.5, 0.0, np.pi / 2])), dvl()], "[imu]\nrotation = [90, 0, 30]",
-        {"heading.yaw_rad": [0.5 - np.radians(30)] * 2}, {}),
+        {"heading.yaw_rad": [0.5 - np.radians(30)] * 2}),
     "orientation in north-east-down": (
         [oriented(NED_NORTH_WEST), dvl()], '[heading]\nworld = "ned"\nrotation = "frd"',
-        {"heading.yaw_rad": [np.radians(135)] * 2}, {}),
-    "declination": ([oriented(YAW), dvl()], OFFSET, {"heading.yaw_rad": [0.75] * 2}, {}),
+        {"heading.yaw_rad": [np.radians(135)] * 2}),
+    "declination": ([oriented(YAW), dvl()], OFFSET, {"heading.yaw_rad": [0.75] * 2}),
     "orientation without a variance, taken all the same": (
         [oriented(YAW, variance=0.0), dvl()], "[heading]\nneeds_variance = false",
-        {"heading.yaw_rad": [0.5] * 2, "heading.sigma_rad": [NAN] * 2},
-        {"log.noise": "heading: 2 of 2 rows say no covariance, heading.sigma_rad"}),
+        {"heading.yaw_rad": [0.5] * 2, "heading.sigma_rad": [NAN] * 2,
+         "log.noise": "heading: 2 of 2 rows say no covariance, heading.sigma_rad"}),
     "stamps of an orientation are the IMU's": (
         [oriented(YAW), dvl()], "[imu]\nstamp_offset_s = 0.05",
-        {"heading.stamps_ns": 1_700_000_000_050_000_000 + np.array([0, 100_000_000])}, {}),
+        {"heading.stamps_ns": 1_700_000_000_050_000_000 + np.array([0, 100_000_000])}),
     "quaternion of a heading by name": (
         [rows_of("/gps/heading", TURNED, [{"quaternion": quaternion(YAW)}] * 3)], "",
-        {"heading.yaw_rad": [0.5] * 3}, {}),
+        {"heading.yaw_rad": [0.5] * 3}),
     "bearing in degrees": (
         [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 90.0, 350.0)])],
-        f"[heading]\n{COMPASS}scale = {float(np.radians(1))!r}", {"heading.yaw_rad": np.radians([90, 0, -260])}, {}),
+        f"[heading]\n{COMPASS}scale = {float(np.radians(1))!r}", {"heading.yaw_rad": np.radians([90, 0, -260])}),
     "bearing taken for rad": (
         [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 350.0)])],
-        f"[heading]\n{COMPASS}", {}, {"log.warnings": "heading: data is up to 350, more than a whole circle in rad"}),
+        f"[heading]\n{COMPASS}", {"log.warnings": "heading: data is up to 350, more than a whole circle in rad"}),
     "sigma of more than a turn": (
-        [oriented(YAW, variance=40.0), dvl()], "", {"heading.sigma_rad": [40.0**0.5] * 2},
-        {"log.warnings": "heading: 2 of 2 rows have a sigma beyond a full turn"}),
+        [oriented(YAW, variance=40.0), dvl()], "", {"heading.sigma_rad": [40.0**0.5] * 2,
+         "log.warnings": "heading: 2 of 2 rows have a sigma beyond a full turn"}),
     "fixes off the Earth": (
-        [points((1, 2, 3), (1.1e7, 0, 0))], "", {"positions.position_m": [[1, 2, 3], [1.1e7, 0, 0]]},
-        {"log.warnings": "positions: 1 of 2 rows have a position beyond 10000 km: estimators do not use them"}),
+        [points((1, 2, 3), (1.1e7, 0, 0))], "", {"positions.position_m": [[1, 2, 3], [1.1e7, 0, 0]],
+         "log.warnings": "positions: 1 of 2 rows have a position beyond 10000 km: estimators do not use them"}),
     "acoustic fixes": (
         [rows_of("/usbl/pose", POSE, [{"pose": {"pose": {"position": vector(1, 2, -3)}, "covariance": [0.0] * 36}}])],
-        "", {"positions.position_m": [[1, 2, -3]]}, {}),
+        "", {"positions.position_m": [[1, 2, -3]]}),
     "fixes in millimetres of a map grid in north-east-down": (
         [points((4.67e9, 5e8, 3000.0))], '[positions]\nworld = "ned"\nscale = 1e-3\norigin_m = [4.67e6, 499990.0, 1.0]',
-        {"positions.position_m": [[10, 0, -2]]}, {}),
+        {"positions.position_m": [[10, 0, -2]]}),
     "a true orientation that never changes": (
-        [moving(0.3, 0.3, 0.3)], FRD_DVL, {}, {"log.warnings": "truth: its orientation is the same in all 3 messages, "
+        [moving(0.3, 0.3, 0.3)], FRD_DVL, {"log.warnings": "truth: its orientation is the same in all 3 messages, "
          "although it moves by 2 m: if that is none, `orientation = false` under [truth]"}),
-    "a true orientation that changes": ([moving(0.3, 0.3, 0.4)], FRD_DVL, {}, {"log.warnings": None}),
+    "a true orientation that changes": ([moving(0.3, 0.3, 0.4)], FRD_DVL, {"log.warnings": None}),
     "a true orientation of a vehicle that stays": (
-        [moving(0.3, 0.3, step_m=0.5)], FRD_DVL, {}, {"log.warnings": None}),
+        [moving(0.3, 0.3, step_m=0.5)], FRD_DVL, {"log.warnings": None}),
     "a true orientation that is none": (
         [moving(0.3, 0.3, 0.3)], FRD_DVL + "[truth]\norientation = false",
-        {"truth.positions": [[0, 0, 0], [1, 0, 0], [2, 0, 0]], "truth.quaternions_xyzw": np.full((3, 4), NAN)},
-        {"log.warnings": None}),
+        {"truth.positions": [[0, 0, 0], [1, 0, 0], [2, 0, 0]], "truth.quaternions_xyzw": np.full((3, 4), NAN),
+         "log.warnings": None}),
     "true positions of a total station": (
         [points((1, 2, 3), (1, 2, 4), topic="/ground_truth/point")], '[truth]\nworld = "ned"',
-        {"truth.positions": [[2, 1, -3], [2, 1, -4]], "truth.quaternions_xyzw": np.full((2, 4), NAN)}, {}),
+        {"truth.positions": [[2, 1, -3], [2, 1, -4]], "truth.quaternions_xyzw": np.full((2, 4), NAN)}),
 }
 EARTH: dict[str, Case] = {
     "first fix is the origin": (
         [fixes(fix(), fix(10.0, altitude=22.0)), tree("gps_link", (1, 2, 3), w=1.0)], "",
         {"positions.position_m": [[0, 0, 0], [0, 10, 2]], "positions.covariance_m2": [np.reshape(SQUARE, (3, 3))] * 2,
-         "calibration.positions.antenna_m": (1, 2, 3)},
-        {"log.origin": "latitude 0.00100000°, longitude 7.00000000°, height 20.000 m, the first fix"}),
+         "calibration.positions.antenna_m": (1, 2, 3),
+         "log.origin": "latitude 0.00100000°, longitude 7.00000000°, height 20.000 m, the first fix"}),
     "depths give the height of fixes without an origin": (
         [fixes(fix(), fix(10.0, altitude=22.0)), pressures(1.3e5, 1.31e5)], "",
         {"positions.position_m": [[0, 0, 0], [0, 10, 0]], "positions.covariance_m2": [
-            [[4, 1, 0], [1, 9, 0], [0, 0, UNMEASURED_M2]]] * 2},
-        {"log.origin": "the first fix; depths give the height, not the fixes"}),
+            [[4, 1, 0], [1, 9, 0], [0, 0, UNMEASURED_M2]]] * 2,
+         "log.origin": "the first fix; depths give the height, not the fixes"}),
     "origin that is said": (
-        [fixes(fix(10.0))], BY_EAST, {"positions.position_m": [[0, 10, 5]]}, {"log.origin": "as configured"}),
+        [fixes(fix(10.0))], BY_EAST, {"positions.position_m": [[0, 10, 5]], "log.origin": "as configured"}),
     "no fix": (
         [fixes(fix(status={"status": -1}), fix(latitude=0.0, longitude=0.0), fix(latitude=NAN), fix(), fix(3.0))], "",
-        {"positions.position_m": [[0, 0, 0], [0, 3, 0]]}, {"log.dropped": "positions: 3 without a fix"}),
+        {"positions.position_m": [[0, 0, 0], [0, 3, 0]], "log.dropped": "positions: 3 without a fix"}),
     "covariance that is not known": (
         [fixes(fix(position_covariance_type=0), fix(position_covariance=[0.0] * 9))], "",
-        {"positions.covariance_m2": np.full((2, 3, 3), NAN)},
-        {"log.noise": "positions: 2 of 2 rows say no covariance"}),
+        {"positions.covariance_m2": np.full((2, 3, 3), NAN),
+         "log.noise": "positions: 2 of 2 rows say no covariance"}),
     "no height": (
         [fixes(fix(), fix(altitude=NAN), fix(altitude=NAN, position_covariance_type=0))], "",
         {"positions.position_m": [[0, 0, 0]] * 3, "positions.covariance_m2": [
             np.reshape(SQUARE, (3, 3)), [[4, 1, 0], [1, 9, 0], [0, 0, UNMEASURED_M2]],
-            np.diag([2.5**2, 2.5**2, UNMEASURED_M2])]}, {}),
+            np.diag([2.5**2, 2.5**2, UNMEASURED_M2])]}),
     "true positions from satellites, with the origin of the fixes": (
         [fixes(fix()), fixes(fix(2.0), fix(3.0), topic="/truth/fix")], "",
-        {"truth.positions": [[0, 2, 0], [0, 3, 0]], "positions.position_m": [[0, 0, 0]]}, {}),
+        {"truth.positions": [[0, 2, 0], [0, 3, 0]], "positions.position_m": [[0, 0, 0]]}),
     "true places on the Earth have no axes of their own": (
         [fixes(fix()), fixes(fix(2.0), fix(3.0), topic="/truth/fix")], NED_ON_EARTH,
-        {"truth.positions": [[0, 2, 0], [0, 3, 0]]}, {}),
+        {"truth.positions": [[0, 2, 0], [0, 3, 0]]}),
 }
 # fmt: on
 
@@ -204,9 +204,8 @@ def test_headings_and_fixes_of_any_driver_become_measurements(foreign, case):
 @pytest.mark.parametrize("case", EARTH.values(), ids=EARTH)
 def test_positions_on_the_earth_become_metres_from_an_origin(foreign, case):
     """To a tenth of a millimetre, by the radius of curvature."""
-    *others, notes = case
-    notes = {"log.origin": "of the world"} | notes
-    foreign.check(*others, notes, atol=1e-4)
+    *others, expected = case
+    foreign.check(*others, {"log.origin": "of the world"} | expected, atol=1e-4)
 
 
 def test_of_several_orientations_that_of_the_imu_in_use_counts(foreign):

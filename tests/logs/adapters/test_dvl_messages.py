@@ -127,68 +127,68 @@ CASES: dict[str, Case] = {
     # types of drivers
     "Water Linked": (
         [water_linked(*({"beams": [beam(i) for i in range(n)]} for n in (4, 3, 0, 4)), {"velocity_valid": False})], "",
-        {"dvl.stamps_ns": ROWS[:4], "dvl.velocity": [VELOCITY] * 4, "dvl.velocity_cov": [np.eye(3) * 0.02**2] * 4},
-        {"log.dropped": "dvl: 1 with velocity_valid not true"}),
+        {"dvl.stamps_ns": ROWS[:4], "dvl.velocity": [VELOCITY] * 4, "dvl.velocity_cov": [np.eye(3) * 0.02**2] * 4,
+         "log.dropped": "dvl: 1 with velocity_valid not true"}),
     "fork with rows": (
         [water_linked({"cov": [vector(*row) for row in COV.tolist()]}, covariance="geometry_msgs/Vector3[] cov")], "",
-        {"dvl.velocity_cov": [COV]}, {}),
+        {"dvl.velocity_cov": [COV]}),
     "fork without its rows": (
-        [water_linked({"cov": []}, covariance="geometry_msgs/Vector3[] cov")], "", {"dvl.velocity_cov": [UNKNOWN]}, {}),
+        [water_linked({"cov": []}, covariance="geometry_msgs/Vector3[] cov")], "", {"dvl.velocity_cov": [UNKNOWN]}),
     "fork with a matrix": (
-        [water_linked({"covariance": KNOWN}, covariance="float64[9] covariance")], "", {"dvl.velocity_cov": [COV]}, {}),
+        [water_linked({"covariance": KNOWN}, covariance="float64[9] covariance")], "", {"dvl.velocity_cov": [COV]}),
     "simulator": (
-        [simulator(KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8)], "", {"dvl.velocity_cov": [COV, UNKNOWN]},
-        {"log.dropped": "dvl: 1 with a covariance that says invalid"}),
+        [simulator(KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8)], "", {"dvl.velocity_cov": [COV, UNKNOWN],
+         "log.dropped": "dvl: 1 with a covariance that says invalid"}),
     "twist by its name": (
         [twists("/dvl/twist")], "",
-        {"dvl.velocity": [VELOCITY] * 3, "dvl.velocity_cov": [np.diag([1.0, 2, 3])] * 3}, {}),
-    "twist beside a Doppler log": ([dvl(4), twists("/dvl/twist")], "", {"dvl.stamps_ns": ROWS[:4]}, {}),
+        {"dvl.velocity": [VELOCITY] * 3, "dvl.velocity_cov": [np.diag([1.0, 2, 3])] * 3}),
+    "twist beside a Doppler log": ([dvl(4), twists("/dvl/twist")], "", {"dvl.stamps_ns": ROWS[:4]}),
     "twist of odometry, in the frame of its child": (
         [twists("/odom", "nav_msgs/msg/Odometry", child_frame_id="child"), tree("child", (0.5, 0, 0), z=1.0)],
         '[dvl]\ntopic = "/odom"',
-        {"dvl.velocity": [VELOCITY] * 3, "calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
+        {"dvl.velocity": [VELOCITY] * 3, "calibration.dvl.mounting.translation_m": (0.5, 0, 0)}),
     "twist of odometry without a child, in the frame of the header": (
         [twists("/dvl/odom", "nav_msgs/msg/Odometry"), tree("dvl_link", (0.5, 0, 0), z=1.0)], "",
-        {"calibration.dvl.mounting.translation_m": (0.5, 0, 0)}, {}),
+        {"calibration.dvl.mounting.translation_m": (0.5, 0, 0)}),
     "velocities that are no numbers": (
         [twists("/dvl/twist"), packets([(1.0, np.inf, 3.0, 0.0), (1.0, 2.0, 3.0, 0.0)])], f'{OF_ARRAY}stamp = "log"',
-        {"dvl.velocity": [VELOCITY]}, {"log.dropped": "dvl: 1 with values that are not finite"}),
+        {"dvl.velocity": [VELOCITY], "log.dropped": "dvl: 1 with values that are not finite"}),
     # units and meanings
     "millimetres": (
         [dvl(velocity=vector(1e3, 2e3, 3e3), velocity_covar=[1e6 * one for one in KNOWN])], "[dvl]\nscale = 0.001",
-        {"dvl.velocity": [VELOCITY] * 5, "dvl.velocity_cov": [COV] * 5}, {}),
+        {"dvl.velocity": [VELOCITY] * 5, "dvl.velocity_cov": [COV] * 5}),
     "deviations": (
         [dvl(velocity_covar=DEVIATIONS.ravel().tolist())], '[dvl]\ncovariance = {meaning = "standard deviation"}',
-        {"dvl.velocity_cov": [DEVIATIONS**2] * 5}, {}),
+        {"dvl.velocity_cov": [DEVIATIONS**2] * 5}),
     "zeros, minus one and what no errors can have": (
         [covariances(KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8, INDEFINITE)], "",
-        {"dvl.velocity_cov": [COV, UNKNOWN, UNKNOWN, UNKNOWN]},
-        {"log.warnings": "dvl: velocity_covar: no covariance in 1 of 4 messages",
+        {"dvl.velocity_cov": [COV, UNKNOWN, UNKNOWN, UNKNOWN],
+         "log.warnings": "dvl: velocity_covar: no covariance in 1 of 4 messages",
          "log.noise": "dvl: 3 of 4 rows say no covariance, dvl.velocity_sigma_m_s"}),
     "minus one is invalid": (
         [covariances(KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8)], '[dvl]\ncovariance = {negative = "invalid"}',
-        {"dvl.velocity_cov": [COV, UNKNOWN], "dvl.stamps_ns": ROWS[:2]}, {}),
+        {"dvl.velocity_cov": [COV, UNKNOWN], "dvl.stamps_ns": ROWS[:2]}),
     "zeros are invalid": (
         [covariances(KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8)], '[dvl]\ncovariance = {zero = "invalid"}',
-        {"dvl.velocity_cov": [COV, UNKNOWN], "dvl.stamps_ns": ROWS[[0, 2]]}, {}),
-    "no covariance": ([covariances(KNOWN)], "[dvl]\ncovariance = false", {"dvl.velocity_cov": [UNKNOWN]}, {}),
-    "one direction": ([covariances(ALONG)], FRD, {}, {"log.warnings": None, "log.noise": None}),
+        {"dvl.velocity_cov": [COV, UNKNOWN], "dvl.stamps_ns": ROWS[[0, 2]]}),
+    "no covariance": ([covariances(KNOWN)], "[dvl]\ncovariance = false", {"dvl.velocity_cov": [UNKNOWN]}),
+    "one direction": ([covariances(ALONG)], FRD, {"log.warnings": None, "log.noise": None}),
     # an unknown type needs only its fields, and a stamp of any unit
     **{f"own type, stamp {stamp}": (
         [packets([(1.0, 2.0, 3.0, 0.01)] * 3, first, step)], f"{OF_ARRAY}stamp = {stamp}",
         {"dvl.velocity": [VELOCITY] * 3, "dvl.velocity_cov": [UNKNOWN] * 3,
-         "dvl.stamps_ns": T0_NS + np.arange(3) * steps_ns}, {})
+         "dvl.stamps_ns": T0_NS + np.arange(3) * steps_ns})
        for stamp, first, step, steps_ns in (
            ('"log"', 0.0, 0.0, 10**8), ('"timestamp"', 1.7e9, 0.25, 250_000_000), (MICROSECONDS, 1.4e15, 1e5, 10**8))},
     "three beams or more": (
         [packets([PAIR, PAIR * [1, 1, np.nan, 1], PAIR * [1, np.nan, np.nan, 1]])], OF_BEAMS,
-        {"dvl.velocity": [VELOCITY] * 2}, {"log.dropped": "dvl: 1 with fewer than 3 valid beams"}),
+        {"dvl.velocity": [VELOCITY] * 2, "log.dropped": "dvl: 1 with fewer than 3 valid beams"}),
     "beams before a velocity, but for those that a driver calls invalid": (
         [water_linked(*[{"beams": [beam(i) | {"valid": i >= bad} for i in range(4)]} for bad in (0, 1, 2, 4)])],
-        WATER_LINKED_BEAMS, {"dvl.stamps_ns": ROWS[:2], "dvl.velocity": SOLVED},
-        {"log.dropped": "dvl: 2 with fewer than 3 valid beams"}),
-    "z down": ([dvl()], "", {}, {"log.warnings": "marine_acoustic_msgs/msg/Dvl has z downwards"}),
-    "z down, mounted": ([dvl(), tree("sensor", x=1.0)], "", {}, {"log.warnings": None}),
+        WATER_LINKED_BEAMS, {"dvl.stamps_ns": ROWS[:2], "dvl.velocity": SOLVED,
+         "log.dropped": "dvl: 2 with fewer than 3 valid beams"}),
+    "z down": ([dvl()], "", {"log.warnings": "marine_acoustic_msgs/msg/Dvl has z downwards"}),
+    "z down, mounted": ([dvl(), tree("sensor", x=1.0)], "", {"log.warnings": None}),
 }
 # fmt: on
 

@@ -101,70 +101,70 @@ CASES: dict[str, Case] = {
     "IMU in degrees and g, z down": (
         [imu(force=(0, 0, -1), rate=(0, 0, 90)), dvl()],
         '[imu]\nrotation = "frd"\nangular_velocity_scale = 0.017453292519943295\nlinear_acceleration_scale = 9.80665',
-        {"imu.specific_force": [[0, 0, 9.80665]] * 5, "imu.angular_velocity": [[0, 0, -np.pi / 2]] * 5}, {}),
+        {"imu.specific_force": [[0, 0, 9.80665]] * 5, "imu.angular_velocity": [[0, 0, -np.pi / 2]] * 5}),
     "yaw of the gyros alone with the wrong sign, after the axes of both": (
         [imu(force=(0, 0, -9.8), rate=(0.1, 0.2, 0.3)), dvl()],
         '[imu]\nrotation = "frd"\nangular_velocity_axes = ["x", "y", "-z"]',
-        {"imu.specific_force": [[0, 0, 9.8]] * 5, "imu.angular_velocity": [[0.1, -0.2, 0.3]] * 5}, {}),
+        {"imu.specific_force": [[0, 0, 9.8]] * 5, "imu.angular_velocity": [[0.1, -0.2, 0.3]] * 5}),
     "gravity put right by the mounting of the frame that is named": (
         [imu(force=(0, 9.8, 0)), dvl(), tree("real_link", (1, 2, 3), x=HALF, w=HALF)],
         FRD_DVL + '[imu]\nframe_id = "real_link"',
-        {"calibration.imu.mounting.translation_m": (1, 2, 3)}, {"log.warnings": None}),
+        {"calibration.imu.mounting.translation_m": (1, 2, 3), "log.warnings": None}),
     "force of zero throughout": (
-        [imu(force=(0, 0, 0)), dvl()], FRD_DVL, {"imu.specific_force": [[NAN] * 3] * 5}, {"log.warnings": NO_FORCE}),
+        [imu(force=(0, 0, 0)), dvl()], FRD_DVL, {"imu.specific_force": [[NAN] * 3] * 5, "log.warnings": NO_FORCE}),
     "force of zero once": (
         [imu(rows=2, at_1={"linear_acceleration": vector(0, 0, 0)}), dvl()], "",
-        {"imu.specific_force": [[0, 0, 9.8], [0, 0, 0]]}, {}),
+        {"imu.specific_force": [[0, 0, 9.8], [0, 0, 0]]}),
     "a row without a rate, and one without a force": (
         [imu(at_1=UNMEASURED_RATE, at_2=UNMEASURED_FORCE), dvl()], "",
         {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 2, 3, 4]),
-         "imu.specific_force": [[0, 0, 9.8], [NAN] * 3, *[[0, 0, 9.8]] * 2]},
-        {"log.dropped": "imu: 1 without angular rate"}),
+         "imu.specific_force": [[0, 0, 9.8], [NAN] * 3, *[[0, 0, 9.8]] * 2],
+         "log.dropped": "imu: 1 without angular rate"}),
     "a rate that is no number": (
         [imu(at_2={"angular_velocity": vector(NAN, 0, 0)}), dvl()], "",
-        {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 1, 3, 4])},
-        {"log.dropped": "imu: 1 with values that are not finite"}),
+        {"imu.stamps_ns": T0_NS + STEP_NS * np.array([0, 1, 3, 4]),
+         "log.dropped": "imu: 1 with values that are not finite"}),
     "wild rate": (
-        [imu(300, at_150={"angular_velocity": vector(0, 0, 30)}), dvl(300)], "", {},
+        [imu(300, at_150={"angular_velocity": vector(0, 0, 30)}), dvl(300)], "",
         {"log.warnings": "imu: 1 angular rate stands out from both neighbours, by 30 rad/s"}),
     # depth
     **{f"pressure, {settings or 'as it is'}": (
-        [pressures(*values)], FRD_DVL + SEA + settings, {"depth.z_m": [0, -10], "depth.variance_m2": [NAN] * 2},
-        {"log.depth": "/ (1025 kg/m3 x 9.80665 m/s2)", "log.warnings": None})
+        [pressures(*values)], FRD_DVL + SEA + settings, {"depth.z_m": [0, -10], "depth.variance_m2": [NAN] * 2,
+         "log.depth": "/ (1025 kg/m3 x 9.80665 m/s2)", "log.warnings": None})
        for settings, values in {
            "": (ONE_ATMOSPHERE, ONE_ATMOSPHERE + TEN_METRES_OF_SEA),
            "atmosphere_pa = 0": (0.0, TEN_METRES_OF_SEA),
            "scale = 100": (1013.25, 1013.25 + TEN_METRES_OF_SEA / 100)}.items()},
     "variance of a pressure in mbar": (
         [pressures(1500.0, variance=(0.05 * 1000 * 9.80665 / 100) ** 2)], "[depth]\nscale = 100",
-        {"depth.variance_m2": [0.05**2]}, {}),
+        {"depth.variance_m2": [0.05**2]}),
     "pressure below the atmosphere's": (
-        [pressures(1013.25, 1500.0)], FRD_DVL, {},
+        [pressures(1013.25, 1500.0)], FRD_DVL,
         {"log.warnings": "less than the atmosphere's: give scale (100 for hPa or mbar)"}),
     **{f"pose as a depth with a {meaning}": (
         [poses(TURN, [*[0.0] * 14, 0.04, *[0.0] * 21], "/dead_reckoning")],
         f'[depth]\ntopic = "/dead_reckoning"\nscale = -1\nvariance = {{meaning = "{meaning}"}}',
-        {"depth.z_m": [-3] * 3, "depth.variance_m2": [variance_m2] * 3}, {"log.depth": None})
+        {"depth.z_m": [-3] * 3, "depth.variance_m2": [variance_m2] * 3, "log.depth": None})
        for meaning, variance_m2 in {"variance": 0.04, "standard deviation": 0.04**2}.items()},
     "bare number counted downwards": (
         [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
-        {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3}, {"log.depth": None}),
+        {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3, "log.depth": None}),
     # reference poses
     **{f"odometry {chosen or 'by its name'}": (
         [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
-        chosen, {"truth.positions": [(1, 2, 3)] * 3}, {"log.truth": None})
+        chosen, {"truth.positions": [(1, 2, 3)] * 3, "log.truth": None})
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
-    **{f"a pose at {entry[0]}": ([entry], "", {}, {"log.truth": f"{entry[0]} only if chosen"})
+    **{f"a pose at {entry[0]}": ([entry], "", {"log.truth": f"{entry[0]} only if chosen"})
        for entry in (poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose"))},
     # heading 30 degrees from north towards east, nose up by 10, right side down by 5; in ENU and FLU: 60 degrees from
     # east towards north, pitch changes sign, roll does not
     "pose in NED and FRD": (
         [poses(angles(30, 10, 5))], '[truth]\nworld = "ned"\nrotation = "frd"',
-        {"truth.positions": [[2, 1, -3]] * 3, "truth.matrices": [angles(60, -10, 5).as_matrix()] * 3}, {}),
+        {"truth.positions": [[2, 1, -3]] * 3, "truth.matrices": [angles(60, -10, 5).as_matrix()] * 3}),
     # the driver's x is our y: with it along the world's x, our x points along the world's -y
     "pose of a turned body": (
         [poses(angles(0, 0, 0))], "[truth]\nrotation = [0, 0, 90]",
-        {"truth.positions": [[1, 2, 3]] * 3, "truth.matrices": [angles(-90, 0, 0).as_matrix()] * 3}, {}),
+        {"truth.positions": [[1, 2, 3]] * 3, "truth.matrices": [angles(-90, 0, 0).as_matrix()] * 3}),
     # landmarks
     "positions as range and azimuth, results as the posterior": (
         [arrays(*FRAMES)], "",
@@ -173,21 +173,21 @@ CASES: dict[str, Case] = {
          "detections.azimuth_rad": [np.arctan2(4, 3), -np.pi / 2, 0, np.pi / 4],
          "detections.candidate_ids": [[7, 8, -1], [1, -1, -1], [12, -1, -1], [1, 2, 3]],
          "detections.id_probability": [[0.6, 0.3, 0], [1, 0, 0], [0.5, 0, 0], [0.1, 0.2, 0.3]],
-         "detections.range_azimuth_cov": np.full((4, 2, 2), np.nan)}, {"log.dropped": "detections: 1 without a result"}),
+         "detections.range_azimuth_cov": np.full((4, 2, 2), np.nan), "log.dropped": "detections: 1 without a result"}),
     "classes with names": (
         [one(("buoy", 0.9), ("3", 0.1))], '[detections]\nids = {"buoy" = 42}',
-        {"detections.candidate_ids": [[42, 3]]}, {}),
+        {"detections.candidate_ids": [[42, 3]]}),
     "an identity far below zero": (
         [arrays([detection((i, 0, 0), (name, 0.9)) for i, name in enumerate((f"-{DIGITS}", "3"), start=1)])], "",
-        {"detections.range_m": [2], "detections.candidate_ids": [[3]]}, {}),
+        {"detections.range_m": [2], "detections.candidate_ids": [[3]]}),
     "position of the box": (
         [arrays([detection((1, 0, 0), ("1", 1.0))])], '[detections]\nposition = "bbox"',
-        {"detections.range_m": [11]}, {}),
+        {"detections.range_m": [11]}),
     "own detections beside an array": (
         [rows_of("/own", "sonar_graph_msgs/msg/LandmarkDetections", [OWN], id_probability=[1.0]), one(("1", 1.0))], "",
-        {"detections.range_m": [2.5]}, {}),
+        {"detections.range_m": [2.5]}),
     "a known covariance": (
-        [one(("1", 1.0), variance=0.04)], "", {"detections.range_azimuth_cov": [np.diag([0.04, 0.04 / 4])]}, {}),
+        [one(("1", 1.0), variance=0.04)], "", {"detections.range_azimuth_cov": [np.diag([0.04, 0.04 / 4])]}),
 }
 REFUSED = {
     "a name": (one(("buoy", 0.9)), "", r"""class 'buoy' is no integer identity.*ids = \{"buoy" = 1\}"""),
@@ -208,7 +208,7 @@ def test_messages_of_any_driver_become_measurements(foreign, case):
     sequence = foreign.check(*case)
     assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
     if (
-        case[3].get("log.depth", "") is None
+        case[2].get("log.depth", "") is None
     ):  # a pose in the world or a bare number has no port to mount
         assert "depth" not in sequence.notes["log.calibration"]
     if said := sequence.notes.get("log.depth"):
@@ -220,11 +220,11 @@ def test_gravity_along_another_axis_is_reported_with_its_rotation(
     foreign, force, warning
 ):
     entries = [imu(force=force), dvl()]
-    notes = foreign.check(entries, FRD_DVL, {}, {"log.doubtful": warning}).notes
+    notes = foreign.check(entries, FRD_DVL, {"log.doubtful": warning}).notes
     said = notes.get("log.doubtful", "")
     if proposed := re.search(r'give (rotation = ("\w+"|\[.*?\]))', said):
         toml = f"{FRD_DVL}[imu]\n{proposed[1]}"
-        foreign.check(entries, toml, {"imu.specific_force": [[0, 0, 9.8]] * 5}, {})
+        foreign.check(entries, toml, {"imu.specific_force": [[0, 0, 9.8]] * 5})
     assert bool(proposed) == (warning is not None and abs(sum(force)) > 9)
 
 
