@@ -101,15 +101,12 @@ def test_tf_is_one_tree_below_the_map(result):
             parents.setdefault(child, set()).add(transform.header.frame_id)
             xs.setdefault(child, []).append(transform.transform.translation.x)
     sensors = "imu", "dvl", "depth", "sonar", "positions"
-    names = "ekf_slam", "isam2", "unsure", "ground_truth"
-    bodies = ["base_link", *(f"{name}/base_link" for name in names)]
-    assert parents == dict.fromkeys(sensors, {"base_link"}) | dict.fromkeys(
-        bodies, {"map"}
-    )
-    causal = result.estimates["ekf-slam"][0]
-    assert (
-        xs["base_link"] == xs["ekf_slam/base_link"] == causal.positions[:, 0].tolist()
-    )
+    expected = {name: {"base_link"} for name in sensors} | {"base_link": {"map"}}
+    for name in ("ekf_slam", "isam2", "unsure", "ground_truth"):
+        expected[f"{name}/base_link"] = {"map"}
+    assert parents == expected
+    of_first = result.estimates["ekf-slam"][0].positions[:, 0].tolist()
+    assert xs["base_link"] == xs["ekf_slam/base_link"] == of_first
     assert xs["isam2/base_link"] == list(np.arange(100.0) + 10)
     instants = [set(map(stamp_ns, m.transforms)) for m in result.messages["/tf"]]
     assert {len(stamps) for stamps in instants} == {1}
