@@ -112,50 +112,35 @@ RUN = {
     "Landmark_Groundtruth.dat": "20 1.5 -2.5 0.001 0.002\n6 3.0 4.0 0.003 0.004\n",
     "Robot1_Odometry.dat": f"{T0}.100 0.1 0.0\n{T0}.300 0.2 0.5\n{T0}.400 0.0 0.0\n",
     "Robot1_Groundtruth.dat": f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n",
-    # of another robot
-    "Robot1_Measurement.dat": f"{T0}.2 14 1 0\n",
+    # the first is of another robot
+    "Robot1_Measurement.dat": f"{T0}.2 14 1 0\n{T0}.3 63 2.5 -0.4\n",
 }
 
 
-def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(tmp_path):
+def test_mrclam_starts_at_its_truth_and_without_one_at_the_origin(tmp_path):
     for name, text in RUN.items():
         (tmp_path / name).write_text(f"# Data Format:\n{text}")
     late = read_mrclam(tmp_path, 1)
-    assert (len(late.truth), late.detections) == (2, None)
+    assert len(late.truth) == 2
     assert "origin" in late.notes["start"]
-    (tmp_path / "Robot1_Groundtruth.dat").unlink()
+    # a command holds until the next
+    assert late.dvl.velocity[:, 0].tolist() == [0.1, 0.1, 0.2]
+    # bearings grow to the left, as azimuths do; bar codes are subjects
+    seen = late.detections
+    assert (seen.range_m, seen.azimuth_rad, seen.candidate_ids) == ([2.5], [-0.4], [6])
+    is_six = late.true_landmarks.ids == 6
+    assert late.true_landmarks.positions[is_six].tolist() == [[3, 4, 0]]
+    reference = tmp_path / "Robot1_Groundtruth.dat"
+    reference.write_text(f"{T0}.0 3 2 1\n{T0}.3 3 2 1\n")
+    start = read_mrclam(tmp_path, 1).calibration.start
+    assert (*start.position_m, start.rpy_rad[2]) == pytest.approx((3, 2, 0, 1))
+    reference.unlink()
     never = read_mrclam(tmp_path, 1)
     assert never.truth is None
     assert never.true_landmarks is not None
     assert "no robot truth" in never.notes["truth"]
     for sequence in (late, never):
         assert sequence.calibration.start.position_m == (0.0, 0.0, 0.0)
-
-
-@pytest.mark.recording
-@pytest.mark.parametrize("robot", [1, 5])
-def test_detections_of_set_6_point_at_the_true_landmarks(unpacked, robot):
-    """Against motion capture; bounds from docs/theory/datasets.md, with room."""
-    folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
-    sequence = read_mrclam(folder, robot)
-    landmarks = sequence.true_landmarks
-    truth = sequence.truth
-    assert landmarks.ids.tolist() == list(range(6, 21))
-    assert T0 - 20 < sequence.start_ns * 1e-9 < T0 + 20
-    d = sequence.detections
-    assert np.isin(d.candidate_ids[:, 0], landmarks.ids).all()
-    d = d.rows(
-        (d.stamps_ns >= truth.stamps_ns[0]) & (d.stamps_ns <= truth.stamps_ns[-1])
-    )
-    stamps_ns, frame = np.unique(d.stamps_ns, return_inverse=True)
-    frames = truth.at(stamps_ns)
-    row = np.searchsorted(landmarks.ids, d.candidate_ids[:, 0])
-    offset = landmarks.positions[row] - frames.positions[frame]
-    x, y, _ = frames.rotations()[frame].inv().apply(offset).T
-    assert np.median(np.abs(d.range_m - np.hypot(x, y))) < 0.15
-    for sign, low, high in ((1, 0, 0.02), (-1, 0.3, np.pi)):
-        off = np.angle(np.exp(1j * (sign * d.azimuth_rad - np.arctan2(y, x))))
-        assert low < np.median(np.abs(off)) < high
 
 
 # ---- what is refused
