@@ -116,7 +116,7 @@ def test_the_tree_of_a_split_bag_is_read_from_the_files_before(bench):
     # two seconds after the first file, and an hour later: another recording
     for number, later_s in enumerate((0, 2, 3602)):
         bench.t0_ns = T0_NS + later_s * 10**9
-        basics = bench.basics(20, bench.t0_ns)
+        basics = bench.basics(20)
         entries = [*basics, (topic, kind, [] if number else messages)]
         found = read_log(bench.write(*entries, name=f"dive_{number}.mcap"))
         is_known = later_s != 3602

@@ -20,7 +20,7 @@ from sonar_graph.logs import inspect_log, read_log, write_log
 from sonar_graph.logs.convert import convert_rosbag, rosbag
 from sonar_graph.logs.convert.rosbag import limited_bz2, limited_lz4, limited_zstd
 from sonar_graph.testing import small_world
-from tests.logs.conftest import recorded, writing
+from tests.logs.conftest import decode, recorded, writing
 
 from .copies import bare
 
@@ -106,14 +106,14 @@ def ros1_bag(tmp_path: Path) -> Path:
     return tmp_path / "old.bag"
 
 
-def test_a_ros_1_bag_becomes_a_ros_2_log(ros1_bag, tmp_path, decoded):
+def test_a_ros_1_bag_becomes_a_ros_2_log(ros1_bag, tmp_path):
     told = []
     new = tmp_path / "new.mcap"
     done = convert_rosbag(ros1_bag, new, lambda *given: told.append(given))
     assert (done.topics, done.messages, done.left_out) == (3, 7, {})
     assert told
     assert all(total == 7 and at <= total for at, total in told)
-    found = decoded(new)
+    found = decode(new)
     stamps = [head_ns(message) for message in found["/imu"]]
     assert stamps == [T0_NS + row * STEP_NS for row in range(5)]
     assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
@@ -188,7 +188,7 @@ def test_a_pipe_in_the_place_of_a_bag_or_in_it_is_refused(tmp_path, name):
         convert_rosbag(source, tmp_path / "new.mcap")
 
 
-def test_a_custom_type_keeps_its_definition(tmp_path, decoded):
+def test_a_custom_type_keeps_its_definition(tmp_path):
     store = ros1_store()
     kind = "provider_dvl/msg/Packet"
     text = "Header header\nfloat64[4] velocity\n"
@@ -199,7 +199,7 @@ def test_a_custom_type_keeps_its_definition(tmp_path, decoded):
     write_bag(Ros1Writer(tmp_path / "own.bag"), store, entries)
     done = convert_rosbag(tmp_path / "own.bag", tmp_path / "own.mcap")
     assert done.shortcomings() == ["left out: /dvl: 1 messages are not of their type"]
-    (found,) = decoded(tmp_path / "own.mcap")["/dvl"]
+    (found,) = decode(tmp_path / "own.mcap")["/dvl"]
     assert found.velocity == [0, 1, 2, 3]
     assert head_ns(found) == T0_NS + 3 * STEP_NS
 
@@ -315,7 +315,7 @@ def test_messages_of_known_drivers_are_defined_where_a_bag_does_not(tmp_path, ve
     assert sequence.dvl.velocity[:, 0].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_unknown_types_are_defined_by_files_of_their_package(tmp_path, decoded):
+def test_unknown_types_are_defined_by_files_of_their_package(tmp_path):
     store = get_typestore(Stores.ROS2_HUMBLE)
     text = "std_msgs/Header header\nfloat64 depth\n"
     kind = "own_msgs/msg/Depth"
@@ -332,10 +332,10 @@ def test_unknown_types_are_defined_by_files_of_their_package(tmp_path, decoded):
         convert_rosbag(bag, new, definitions=tmp_path / "ws")
     (package / "Depth.msg").write_text(text)
     assert convert_rosbag(bag, new, definitions=tmp_path / "ws").left_out == {}
-    assert decoded(new)["/depth"][0].depth == 3.5
+    assert decode(new)["/depth"][0].depth == 3.5
 
 
-def test_ros_1_messages_in_mcap_become_those_of_ros_2(tmp_path, decoded):
+def test_ros_1_messages_in_mcap_become_those_of_ros_2(tmp_path):
     store = ros1_store()
     path = tmp_path / "old.mcap"
     channels: dict[str, int] = {}
@@ -353,7 +353,7 @@ def test_ros_1_messages_in_mcap_become_those_of_ros_2(tmp_path, decoded):
     assert f"`sonar-graph convert rosbag {path} -o OUT.mcap`" in refusals["/imu"]
     done = convert_rosbag(path, tmp_path / "new.mcap")
     assert (done.topics, done.messages, done.left_out) == (3, 7, {})
-    found = decoded(tmp_path / "new.mcap")
+    found = decode(tmp_path / "new.mcap")
     assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
     assert found["/tf_static"][0].transforms[0].transform.translation.y == 2
     with pytest.raises(LogError, match="already an MCAP file: read it directly"):

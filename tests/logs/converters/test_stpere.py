@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.evaluation.metrics import aligned_errors_m, rmse
 from sonar_graph.logs.convert import read_stpere
 
 T0 = 1_000
@@ -76,33 +75,3 @@ def test_a_missing_file_or_folder_is_named(folder):
     )
     doppler.mkdir()
     refused(folder, r"DVL\.log: holds no files")
-
-
-@pytest.fixture(scope="module")
-def run(unpacked):
-    return read_stpere(next(unpacked("stpere.tar.xz").rglob("MTI.log")).parent)
-
-
-def reckoned_error(run, yaw_rad, mirror=False):
-    """Horizontal error against the satellites, aligned, of velocities without spikes turned by headings, m."""
-    dvl = run.dvl.rows(np.linalg.norm(run.dvl.velocity, axis=1) < 1)
-    R = run.calibration.dvl.mounting.rotation_matrix()
-    forward, left, _ = (dvl.velocity @ R.T * [1, -1 if mirror else 1, 1]).T
-    turned = np.interp(dvl.stamps_ns, run.heading.stamps_ns, yaw_rad)
-    speed = (forward + 1j * left) * np.exp(1j * turned)
-    path = np.cumsum(speed[:-1] * np.diff(dvl.stamps_ns) * 1e-9)
-    at = np.interp(run.truth.stamps_ns, dvl.stamps_ns, np.append(0, path))
-    flat = np.column_stack([at.real, at.imag, 0 * at.real])
-    return rmse(aligned_errors_m(flat, run.truth.positions)[:, :2])
-
-
-@pytest.mark.recording
-class TestRecording:
-    """Against satellite positions of a buoy that the vehicle tows."""
-
-    def test_compass_and_doppler_log_reckon_the_satellites_path(self, run):
-        """4.1 m; a mirrored Doppler log, or headings of the other sense, do not."""
-        yaw_rad = np.unwrap(run.heading.yaw_rad)
-        assert reckoned_error(run, yaw_rad) < 4.5
-        assert reckoned_error(run, yaw_rad, mirror=True) > 7
-        assert reckoned_error(run, -yaw_rad) > 40
