@@ -12,42 +12,41 @@ from sonar_graph.logs.measured_start import with_measured_start
 from sonar_graph.measurements import (
     Depth,
     Dvl,
+    Floats,
     Imu,
     PositionFixes,
 )
 from sonar_graph.sequence import Sequence
 
 RPY = (0.1, -0.05, 0.7)
-N = 3000
 
 
-def moving(rpy: tuple[float, float, float] = RPY, seed: int = 0) -> dict[str, Any]:
+def moving(rpy: tuple[float, float, float] = RPY) -> dict[str, Any]:
     """A vehicle of fixed roll and pitch that turns, 60 s: IMU 50 Hz, Doppler log and depth 5 Hz, fixes 1 Hz."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(N) / 50
-    yaw = rpy[2] + 0.1 * t
-    world_R_body = Rotation.from_euler(
-        "ZYX", np.column_stack([yaw, np.full(N, rpy[1]), np.full(N, rpy[0])])
-    )
-    v = np.column_stack([0.8 * np.cos(yaw), 0.8 * np.sin(yaw), -0.05 * np.ones(N)])
-    a = np.gradient(v, t, axis=0)
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 50
+    stamps_ns = (t * 1e9).astype(np.int64)
+    roll, pitch, yaw = np.add(rpy, [[0, 0, 0.1 * s] for s in t]).T
+    body_R_world = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).inv()
+    v = np.column_stack([0.8 * np.cos(yaw), 0.8 * np.sin(yaw), 0 * t - 0.05])
+    force = np.gradient(v, t, axis=0) + [0.0, 0.0, 9.80665]
+    rate = np.tile([0.0, 0.0, 0.1], (3000, 1))
+    imu = Imu(stamps_ns, body_R_world.apply(rate), body_R_world.apply(force))
+
+    def seen(values: Floats, step: int, sigma: float) -> tuple[Any, ...]:
+        """Some rows with noise and unknown covariances."""
+        some = values[::step]
+        covariances = np.full((len(some), 3, 3), np.nan)
+        return stamps_ns[::step], some + rng.normal(0, sigma, some.shape), covariances
+
     place = np.cumsum(v, axis=0) / 50 + [100.0, 50.0, -14.0]
-    stamps_ns = np.asarray(t * 1e9, np.int64)
-    rate = world_R_body.inv().apply([0.0, 0.0, 0.1] * np.ones((N, 3)))
-    imu = Imu(stamps_ns, rate, world_R_body.inv().apply(np.add(a, [0.0, 0.0, 9.80665])))
-    body_v = world_R_body.inv().apply(v)[::10] + rng.normal(0, 0.01, (N // 10, 3))
-    nan = np.full((N // 10, 3, 3), np.nan)
-    depth = Depth(
-        stamps_ns[::10], place[::10, 2] + rng.normal(0, 0.01, N // 10), nan[:, 0, 0]
-    )
-    fixes = PositionFixes(
-        stamps_ns[::50], place[::50] + rng.normal(0, 0.3, (N // 50, 3)), nan[: N // 50]
-    )
+    velocity = seen(body_R_world.apply(v), 10, 0.01)
+    at_ns, depth_m, _ = seen(place[:, 2], 10, 0.01)
     return {
         "imu": imu,
-        "dvl": Dvl(stamps_ns[::10], body_v, nan),
-        "depth": depth,
-        "positions": fixes,
+        "dvl": Dvl(*velocity),
+        "depth": Depth(at_ns, depth_m, np.full(300, np.nan)),
+        "positions": PositionFixes(*seen(place, 50, 0.3)),
     }
 
 
