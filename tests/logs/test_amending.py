@@ -106,11 +106,9 @@ def test_intact_messages_of_a_truncated_log_are_copied(tmp_path, share):
     assert len(after.pop("/map")) == 2
     for name, found in after.items():
         assert found == before[name][: len(found)]
-    assert after["attachments"] == before["attachments"]
     topics = scan(source, lambda _: Keep.NONE).topics
     for name, topic in topics.items():
         assert len(after[name]) == 1 + len(topic)
-    assert 0.5 * share < (len(after["/one"]) - 1) / 400 < 1.5 * share
     assert scan(target, lambda _: Keep.NONE).ending is None
     last_ns = max(after[name][-1][0] for name in topics)
     said = f"cut off.*what is there spans {last_ns * 1e-9:.3f} s"

@@ -29,7 +29,7 @@ def moving(rpy: tuple[float, float, float] = RPY) -> dict[str, Any]:
     roll, pitch, yaw = np.add(rpy, [[0, 0, 0.1 * s] for s in t]).T
     body_R_world = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).inv()
     v = np.column_stack([0.8 * np.cos(yaw), 0.8 * np.sin(yaw), 0 * t - 0.05])
-    force = np.gradient(v, t, axis=0) + [0.0, 0.0, 9.80665]
+    force = np.add(np.gradient(v, t, axis=0), [0.0, 0.0, 9.80665])
     rate = np.tile([0.0, 0.0, 0.1], (3000, 1))
     imu = Imu(stamps_ns, body_R_world.apply(rate), body_R_world.apply(force))
 

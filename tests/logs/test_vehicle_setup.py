@@ -82,7 +82,6 @@ def test_the_mounting_of_an_imaging_sonar_comes_from_tf_static(make_sequence, tm
 STEP = gtsam.Pose3(gtsam.Rot3.Rz(0.5), np.array([1.0, 0.0, -0.2]))
 BELOW = gtsam.Pose3(gtsam.Rot3.Rx(0.1), np.array([0.0, 0.0, 0.3]))
 NAMED_TREES: dict[str, tuple[str, dict[str, tuple[str, gtsam.Pose3 | str]], gtsam.Pose3]] = {
-    "a namespace": ("bluerov2/dvl", {"bluerov2/dvl": ("bluerov2/base_link", STEP)}, STEP),
     "a namespace in the tree alone": ("dvl", {"auv1/dvl": ("auv1/base_link", STEP)}, STEP),
     "a namespace in the messages alone": ("auv1/dvl", {"dvl": ("base_link", STEP)}, STEP),
     "a footprint alone": ("dvl", {"dvl": ("base_footprint", STEP)}, STEP),

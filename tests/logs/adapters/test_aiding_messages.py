@@ -129,9 +129,6 @@ CASES: dict[str, Case] = {
     "quaternion of a heading by name": (
         [rows_of("/gps/heading", TURNED, [{"quaternion": quaternion(YAW)}] * 3)], "",
         {"heading.yaw_rad": [0.5] * 3}),
-    "bearing in degrees": (
-        [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 90.0, 350.0)])],
-        f"[heading]\n{COMPASS}scale = {float(np.radians(1))!r}", {"heading.yaw_rad": np.radians([90, 0, -260])}),
     "bearing taken for rad": (
         [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 350.0)])],
         f"[heading]\n{COMPASS}", {"log.warnings": "heading: data is up to 350, more than a whole circle in rad"}),

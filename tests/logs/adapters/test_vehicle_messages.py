@@ -44,13 +44,8 @@ def poses(
     return rows_of(topic, kind or POSE_WITH_COVARIANCE, [row] * 3)
 
 
-def angles(*yaw_pitch_roll_deg: float) -> Rotation:
-    return Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True)
-
-
 TURN = Rotation.from_euler("z", 1)
 SEA = "[depth]\nwater_density_kg_m3 = 1025\n"
-HEIGHT = 'type = "std_msgs/msg/Float64"\nheight = "data"\nscale = -1\nstamp = "log"\nframe_id_field = false'
 NO_FORCE = (
     "imu: linear_acceleration.x, linear_acceleration.y, linear_acceleration.z are 0 in every message, which no "
     "accelerometer measures: taken as not measured"
@@ -98,10 +93,6 @@ OWN = {
 }
 # fmt: off
 CASES: dict[str, Case] = {
-    "IMU in degrees and g, z down": (
-        [imu(force=(0, 0, -1), rate=(0, 0, 90)), dvl()],
-        '[imu]\nrotation = "frd"\nangular_velocity_scale = 0.017453292519943295\nlinear_acceleration_scale = 9.80665',
-        {"imu.specific_force": [[0, 0, 9.80665]] * 5, "imu.angular_velocity": [[0, 0, -np.pi / 2]] * 5}),
     "yaw of the gyros alone with the wrong sign, after the axes of both": (
         [imu(force=(0, 0, -9.8), rate=(0.1, 0.2, 0.3)), dvl()],
         '[imu]\nrotation = "frd"\nangular_velocity_axes = ["x", "y", "-z"]',
@@ -146,9 +137,6 @@ CASES: dict[str, Case] = {
         f'[depth]\ntopic = "/dead_reckoning"\nscale = -1\nvariance = {{meaning = "{meaning}"}}',
         {"depth.z_m": [-3] * 3, "depth.variance_m2": [variance_m2] * 3, "log.depth": None})
        for meaning, variance_m2 in {"variance": 0.04, "standard deviation": 0.04**2}.items()},
-    "bare number counted downwards": (
-        [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
-        {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3, "log.depth": None}),
     # reference poses
     **{f"odometry {chosen or 'by its name'}": (
         [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
@@ -156,15 +144,11 @@ CASES: dict[str, Case] = {
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
     **{f"a pose at {entry[0]}": ([entry], "", {"log.truth": f"{entry[0]} only if chosen"})
        for entry in (poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose"))},
-    # heading 30 degrees from north towards east, nose up by 10, right side down by 5; in ENU and FLU: 60 degrees from
-    # east towards north, pitch changes sign, roll does not
-    "pose in NED and FRD": (
-        [poses(angles(30, 10, 5))], '[truth]\nworld = "ned"\nrotation = "frd"',
-        {"truth.positions": [[2, 1, -3]] * 3, "truth.matrices": [angles(60, -10, 5).as_matrix()] * 3}),
     # the driver's x is our y: with it along the world's x, our x points along the world's -y
     "pose of a turned body": (
-        [poses(angles(0, 0, 0))], "[truth]\nrotation = [0, 0, 90]",
-        {"truth.positions": [[1, 2, 3]] * 3, "truth.matrices": [angles(-90, 0, 0).as_matrix()] * 3}),
+        [poses(Rotation.identity())], "[truth]\nrotation = [0, 0, 90]",
+        {"truth.positions": [[1, 2, 3]] * 3,
+         "truth.matrices": [Rotation.from_euler("z", -90, degrees=True).as_matrix()] * 3}),
     # landmarks
     "positions as range and azimuth, results as the posterior": (
         [arrays(*FRAMES)], "",
