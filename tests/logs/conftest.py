@@ -34,10 +34,8 @@ TYPES = {
     "imu": "sensor_msgs/msg/Imu",
     "dvl": "marine_acoustic_msgs/msg/Dvl",
     "pressure": "sensor_msgs/msg/FluidPressure",
-    "depth": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "odometry": "nav_msgs/msg/Odometry",
     "detections": "sonar_graph_msgs/msg/LandmarkDetections",
-    "map": "sonar_graph_msgs/msg/LandmarkMap",
 }
 Entry = tuple[Any, ...]
 """Topic, type or a word for it, messages, and the definition where it is not the usual one."""

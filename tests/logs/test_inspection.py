@@ -107,26 +107,12 @@ FOREIGN = {
         "json",
         "has messages in json; only ROS 2 CDR is read",
     ),
-    "/protobuf": (
-        "pkg.Some",
-        "protobuf",
-        b"\x0a\xff",
-        "protobuf",
-        "has messages in protobuf; only ROS 2 CDR is read",
-    ),
     "/idl": (
         IMU,
         "ros2idl",
         IDL.encode(),
         "cdr",
         "has a definition in ros2idl; only ros2msg is read: record it",
-    ),
-    "/flat": (
-        IMU,
-        "flatbuffer",
-        b"\0",
-        "cdr",
-        "has a definition in flatbuffer; only ros2msg is read",
     ),
     "/wide": (
         "a/msg/B",

@@ -136,11 +136,6 @@ class Foreign(Bench):
     t0_ns = T0_NS
     definitions = DEFINITIONS
 
-    @property
-    def folder(self) -> Path:
-        """Folder of the log and its configuration."""
-        return self._folder
-
     @staticmethod
     def stamps(rows: int) -> np.ndarray:
         """Stamps of the messages that `rows_of` makes, nanoseconds."""

@@ -70,10 +70,10 @@ REFUSALS: dict[str, Refusal] = {
 
 @pytest.mark.parametrize(("entries", "toml", "named"), REFUSALS.values(), ids=REFUSALS)
 def test_a_refusal_names_its_cause_and_what_accepts_the_input(
-    foreign, entries, toml, named
+    foreign, tmp_path, entries, toml, named
 ):
     with pytest.raises(LogError, match=named) as refusal:
         foreign.read(*entries, toml=toml)
-    without_folder = str(refusal.value).replace(f"{foreign.folder}/", "")
+    without_folder = str(refusal.value).replace(f"{tmp_path}/", "")
     assert without_folder.startswith(("log.mcap: ", "log.toml: "))
     assert len(without_folder) <= LONGEST
