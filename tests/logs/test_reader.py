@@ -188,29 +188,29 @@ FAULTS = {
     "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
     "a chunk's opcode": Fault(in_chunk(1, 0, 0x80)),
     "a chunk's size beyond all memory": Fault(huge_size, 1, SECOND),
-    "both lengths of a chunk": Fault(both_lengths, None, "", "", PLAIN),
+    "both lengths of a chunk": Fault(both_lengths, options=PLAIN),
     "bytes missing": Fault(missing_in_chunk(1, 1500), 1, "no valid record", MOVED),
     "the first chunk, with the descriptions": Fault(
         in_chunk(0, 100), 0, "chunk 1 is lost"
     ),
-    "a message index": Fault(in_index(15), None, "", "", PLAIN),
+    "a message index": Fault(in_index(15), options=PLAIN),
     "a longer message outside chunks": Fault(
-        message_200(1, 1), 200, "1 of /bytes", "", LOOSE
+        message_200(1, 1), 200, "1 of /bytes", options=LOOSE
     ),
     "a shorter message outside chunks": Fault(
-        message_200(1, 64), 200, "no valid record", "", LOOSE
+        message_200(1, 64), 200, "no valid record", options=LOOSE
     ),
     "a type's name outside chunks": Fault(
-        at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE
+        at_text(b"test_msgs/msg/Bytes"), remark=TWICE, options=LOOSE
     ),
     # it claims 29 bytes and has 13
     "a length in a description": Fault(
-        at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED
+        at_text(b"uint8[] d", -4, 16), None, "description of a ch", options=UNREPEATED
     ),
     "the length of metadata": Fault(
         at_text(b"sonar_graph", -12, 64), None, "no valid record; no messages lost"
     ),
-    "zeros after the end": Fault(tail(bytes(5000)), None, "", ENDING),
+    "zeros after the end": Fault(tail(bytes(5000)), remark=ENDING),
 } | {
     f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit))
     for at in (1, 2, 5, 8)

@@ -121,6 +121,11 @@ def dvl(rows: int = 5, **fields: Any) -> Entry:
     return rows_of("/dvl", "marine_acoustic_msgs/msg/Dvl", [message] * rows)
 
 
+def pressures(*values: float, variance: float = 0.0) -> Entry:
+    rows = [{"fluid_pressure": value} for value in values]
+    return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=variance)
+
+
 def about_values(warnings: str) -> str:
     """Warnings without those about frames: those of most of these messages hang on no tree (`test_vehicle_setup`)."""
     return re.sub(

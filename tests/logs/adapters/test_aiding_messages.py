@@ -21,6 +21,7 @@ from .conftest import (
     dvl,
     imu,
     interface,
+    pressures,
     rows_of,
     vector,
 )
@@ -75,11 +76,6 @@ def fixes(*rows: dict[str, Any], topic: str = "/gps/fix") -> Entry:
 
 def points(*places: tuple[float, float, float], topic: str = "/usbl/point") -> Entry:
     return rows_of(topic, POINT, [{"point": vector(*place)} for place in places])
-
-
-def pressures(*values: float) -> Entry:
-    rows = [{"fluid_pressure": value} for value in values]
-    return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=0.0)
 
 
 def moving(*yaws_rad: float, step_m: float = 1.0) -> Entry:

@@ -14,7 +14,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import body_to_ros, range_and_azimuth
 from tests.logs.conftest import quaternion, tree
 
-from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, rows_of, vector
+from .conftest import STEP_NS, T0_NS, Case, Entry, dvl, imu, pressures, rows_of, vector
 
 FRD_DVL = '[dvl]\nrotation = "frd"\n'
 """Without a warning about the Doppler log."""
@@ -24,11 +24,6 @@ POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 HALF = float(np.sqrt(0.5))
 NAN = float("nan")
-
-
-def pressures(*values: float, variance: float = 0.0) -> Entry:
-    rows = [{"fluid_pressure": value} for value in values]
-    return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=variance)
 
 
 def poses(

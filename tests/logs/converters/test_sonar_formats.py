@@ -101,10 +101,10 @@ MARKED[0, 0] = 255
     [  # the first beam in a file is the right-most, unless the sonar is upside down
         (Ddf(MARKED), -14.26, 14.25),
         (Ddf(MARKED, reverse=1), 14.25, -14.26),
-        (Aris(images(2, 128, 64), mode=9, system=1), -14.705, 14.705),
+        (Aris(images(2, 128, 64)), -14.705, 14.705),
         (Aris(images(2, 48, 64), mode=1, system=2, telephoto=1), -6.742, 6.742),
         (
-            Aris(images(2, 128, 64), mode=9, system=1, telephoto=1),
+            Aris(images(2, 128, 64), telephoto=1),
             -7.0 * 127 / 128,
             7.0 * 127 / 128,
         ),  # no table
