@@ -103,8 +103,6 @@ rpy = ["position_covariance[1]", "position_covariance[2]", "position_covariance[
 """
 # fmt: off
 CASES: dict[str, Case] = {
-    "orientation that says its variance": (
-        [oriented(YAW), dvl()], "", {"heading.yaw_rad": [0.5] * 2, "heading.sigma_rad": [0.1] * 2}),
     "orientation of a turned IMU": (
         [oriented(YAW), dvl(), tree("imu_link", z=np.sin(0.1), w=np.cos(0.1))], "",
         {"heading.yaw_rad": [0.3] * 2, "calibration.imu.mounting.rpy_rad": [0, 0, 0.2]}),
@@ -122,9 +120,6 @@ CASES: dict[str, Case] = {
     "stamps of an orientation are the IMU's": (
         [oriented(YAW), dvl()], "[imu]\nstamp_offset_s = 0.05",
         {"heading.stamps_ns": 1_700_000_000_050_000_000 + np.array([0, 100_000_000])}),
-    "quaternion of a heading by name": (
-        [rows_of("/gps/heading", TURNED, [{"quaternion": quaternion(YAW)}] * 3)], "",
-        {"heading.yaw_rad": [0.5] * 3}),
     "bearing taken for rad": (
         [("/compass", "std_msgs/msg/Float64", [{"data": bearing} for bearing in (0.0, 350.0)])],
         f"[heading]\n{COMPASS}", {"log.warnings": "heading: data is up to 350, more than a whole circle in rad"}),

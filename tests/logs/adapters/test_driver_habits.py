@@ -16,7 +16,6 @@ from tests.logs.conftest import Entry, tree, vector
 ROWS = 60
 LOST = np.arange(20, 40)
 """Rows that were sent without bottom lock."""
-MARINE = "marine_acoustic_msgs/msg/Dvl"
 NO_LOCK = vector(0, 0, 0)
 
 
@@ -26,15 +25,14 @@ def velocity(row: int) -> dict[str, float]:
     return vector(*(np.array([0.6 + 0.1 * np.sin(row / 9), 0.1, 0.02]) + noise))
 
 
-def report(*, kind: str = MARINE, lost: dict[str, Any], **sent: Any) -> Entry:
+def report(*, lost: dict[str, Any], **sent: Any) -> Entry:
     """Messages of a Doppler log; `LOST` have other fields."""
-    common = {"velocity_mode": 1, "num_good_beams": 4, "sound_speed": 1480.0}
-    common = (common if kind == MARINE else {}) | {"altitude": 3.0} | sent
+    common = {"velocity_mode": 1, "num_good_beams": 4, "altitude": 3.0} | sent
     rows = [
         common | {"velocity": velocity(row)} | (lost if row in LOST else {})
         for row in range(ROWS)
     ]
-    return rows_of("/dvl", kind, rows, "dvl_link")
+    return rows_of("/dvl", "marine_acoustic_msgs/msg/Dvl", rows, "dvl_link")
 
 
 def twists() -> Entry:
@@ -73,11 +71,6 @@ WITHOUT_LOCK: dict[str, tuple[Entry, str]] = {
     "PD0, its value for not measured": (
         report(lost={"velocity": vector(-32.768, -32.768, -32.768)}),
         "20 with one value beyond 30 m/s in all components",
-    ),
-    "dvl_msgs, velocity_valid": (
-        report(kind="dvl_msgs/msg/DVL", velocity_valid=True, fom=0.01,
-               lost={"velocity_valid": False, "altitude": -1.0, "velocity": NO_LOCK}),
-        "20 with velocity_valid not true",
     ),
     "twists, a covariance of -1 where nothing was measured": (
         twists(), "20 with a covariance that says invalid",

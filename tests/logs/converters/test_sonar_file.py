@@ -99,7 +99,6 @@ def without(*lost: int) -> list[int]:
 
 # fmt: off
 FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
-    "nothing": (lambda frames, _: frames, EVERY, "^$"),
     "a frame twice": (lambda f, _: [*f[:3], *f[2:]], EVERY, "a repetition of the frame at byte"),
     "two settings that alternate": (other_settings({1: 4, 3: 4, 5: 4}), EVERY, "^$"),  # as some sonars have
     "damaged settings side by side": (
