@@ -165,76 +165,42 @@ def one_of(bench: Bench, **changed: Any) -> Path:
     return detected(bench, *frames)
 
 
-MESSAGE = r"topic /landmarks: message 1 has "
+# fmt: off
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "lists": (
-        {"azimuth_rad": [0.1]},
-        MESSAGE + "2 ranges, 1 azimuths, 8 covariance elements, 2 identities",
-    ),
-    "tracks": (
-        {"track": [1]},
-        MESSAGE + "2 ranges and 1 tracks; expected as many, or none",
-    ),
-    "2^56": (
-        {"candidate_ids": [5, 2**56]},
-        MESSAGE + r"an identity of 2\^56 or more; number",
-    ),
+    "lists": ({"azimuth_rad": [0.1]}, "2 ranges, 1 azimuths, 8 covariance elements, 2 identities"),
+    "tracks": ({"track": [1]}, "2 ranges and 1 tracks; expected as many, or none"),
+    "2^56": ({"candidate_ids": [5, 2**56]}, r"an identity of 2\^56 or more; number"),
 }
+# fmt: on
 
 
 @pytest.mark.parametrize(("changed", "message"), REFUSED.values(), ids=REFUSED)
 def test_a_message_that_breaks_its_rules_is_named(bench, changed, message):
     path = one_of(bench, **changed)
+    message = f"topic /landmarks: message 1 has {message}"
     with pytest.raises(LogError, match=message) as caught:
         read_log(path)
     assert "\n" not in str(caught.value)
     assert str(caught.value) in inspect_log(path).unusable
 
 
-POSTERIOR = "1 with probabilities that are not between 0 and 1 or more than 1 in sum"
-RANGE = "a range that is not above 0 and at most 100 km"
 COVARIANCE = "a covariance that is not positive definite"
+# fmt: off
 TOLD: dict[str, tuple[dict[str, Any], int, str]] = {
     "sound": ({}, 3, ""),
     "largest identity": ({"candidate_ids": [5, 2**56 - 1]}, 3, ""),
-    "unknown covariance": (
-        {"covariance": [np.nan] * 8, "track": [3, 4]},
-        3,
-        "2 of 3 rows say no covariance",
-    ),
-    "degrees": (
-        {"azimuth_rad": [-40.0, 1.0]},
-        3,
-        "1 of 3 rows have an azimuth beyond a full turn in rad (up to 40)",
-    ),
-    "97 %": ({"id_probability": [97.0, 0.5]}, 2, POSTERIOR),
-    "range": ({"range_m": [-1.0, 2.0]}, 3, f"1 of 3 rows have {RANGE}"),
-    "no covariance": (
-        {"covariance": [0.0] * 4 + [0.01, 0, 0, 0.02]},
-        3,
-        f"1 of 3 rows have {COVARIANCE}",
-    ),
-    "singular": (
-        {"covariance": [1.0, 1, 1, 1] * 2},
-        3,
-        f"2 of 3 rows have {COVARIANCE}",
-    ),
-    "track": (
-        {"track": [7, 7]},
-        3,
-        "1 of 3 rows have the track number of another row of their frame, in 1 frames",
-    ),
-    "early": (
-        {"header": header(T0_NS - 5 * 10**9)},
-        3,
-        "2 of 3 rows have a stamp before the first odometry",
-    ),
-    "late": (
-        {"header": header(T0_NS + 60 * 10**9)},
-        3,
-        "2 of 3 rows have a stamp after the last odometry",
-    ),
+    "unknown covariance": ({"covariance": [np.nan] * 8, "track": [3, 4]}, 3, "2 of 3 rows say no covariance"),
+    "degrees": ({"azimuth_rad": [-40.0, 1.0]}, 3, "1 of 3 rows have an azimuth beyond a full turn in rad (up to 40)"),
+    "97 %": ({"id_probability": [97.0, 0.5]}, 2,
+             "1 with probabilities that are not between 0 and 1 or more than 1 in sum"),
+    "range": ({"range_m": [-1.0, 2.0]}, 3, "1 of 3 rows have a range that is not above 0 and at most 100 km"),
+    "no covariance": ({"covariance": [0.0] * 4 + [0.01, 0, 0, 0.02]}, 3, f"1 of 3 rows have {COVARIANCE}"),
+    "singular": ({"covariance": [1.0, 1, 1, 1] * 2}, 3, f"2 of 3 rows have {COVARIANCE}"),
+    "track": ({"track": [7, 7]}, 3, "1 of 3 rows have the track number of another row of their frame, in 1 frames"),
+    "early": ({"header": header(T0_NS - 5 * 10**9)}, 3, "2 of 3 rows have a stamp before the first odometry"),
+    "late": ({"header": header(T0_NS + 60 * 10**9)}, 3, "2 of 3 rows have a stamp after the last odometry"),
 }
+# fmt: on
 
 
 @pytest.mark.parametrize(("changed", "rows", "account"), TOLD.values(), ids=TOLD)

@@ -79,9 +79,7 @@ def write_bag(writer: Any, store: Any, entries: list[tuple[str, str, Any]]) -> N
     with writer:
         for row, (topic, kind, message) in enumerate(entries):
             if topic not in connections:
-                latched = (
-                    {"latching": 1 if topic == "/tf_static" else None} if ros1 else {}
-                )
+                latched = {"latching": 1} if ros1 and topic == "/tf_static" else {}
                 connections[topic] = writer.add_connection(
                     topic, kind, typestore=store, **latched
                 )
