@@ -100,44 +100,14 @@ def test_what_this_package_wrote_gives_no_warning(tmp_path):
 IMU = "sensor_msgs/msg/Imu"
 IDL = "module sensor_msgs { module msg { struct Imu { double x; }; }; };"
 FOREIGN = {
-    "/json": (
-        "Some",
-        "jsonschema",
-        b"{}",
-        "json",
-        "has messages in json; only ROS 2 CDR is read",
-    ),
-    "/idl": (
-        IMU,
-        "ros2idl",
-        IDL.encode(),
-        "cdr",
-        "has a definition in ros2idl; only ros2msg is read: record it",
-    ),
-    "/wide": (
-        "a/msg/B",
-        "ros2msg",
-        b"wstring s\n",
-        "cdr",
-        "cannot be read: the definition of a/B uses wstring",
-    ),
-    "/loop": (
-        "a/msg/B",
-        "ros2msg",
-        b"B[] b\n",
-        "cdr",
-        "cannot be read: the definition of a/B uses a/B within itself",
-    ),
-    "/noise": (
-        IMU,
-        "ros2msg",
-        b"\xff\xfe{",
-        "cdr",
-        "has a definition that cannot be read: the definition of",
-    ),
+    "/json": ("Some", "jsonschema", b"{}", "json", "has messages in json; only ROS 2 CDR is read"),
+    "/idl": (IMU, "ros2idl", IDL.encode(), "cdr", "has a definition in ros2idl; only ros2msg is read: record it"),
+    "/wide": ("a/msg/B", "ros2msg", b"wstring s\n", "cdr", "cannot be read: the definition of a/B uses wstring"),
+    "/loop": ("a/msg/B", "ros2msg", b"B[] b\n", "cdr", "cannot be read: the definition of a/B uses a/B within itself"),
+    "/noise": (IMU, "ros2msg", b"\xff\xfe{", "cdr", "has a definition that cannot be read: the definition of"),
     "/bare": ("", "", b"", "cdr", "has no definition of its messages"),
     "/nothing": ("", "", b"", "", "has messages in no named encoding"),
-}
+}  # fmt: skip
 
 
 def copied(

@@ -171,26 +171,14 @@ def test_a_section_is_completed_by_the_log_or_taken_away_by_false():
 
 
 MISTAKES: list[tuple[dict[str, Any], str]] = [
-    (
-        {"imu": {"gyro_sigma": 1}},
-        r"^vehicle\.toml: imu\.gyro_sigma: there is no such field",
-    ),
+    ({"imu": {"gyro_sigma": 1}}, r"^vehicle\.toml: imu\.gyro_sigma: there is no such field"),
     ({"floor": {"z": 1}}, r"^vehicle\.toml: .*floor\.z: there is no such field"),
-    (
-        {"start": {"position_m": [1, 2]}},
-        r"start\.position_m: expected 3 values, not \[1, 2\]",
-    ),
+    ({"start": {"position_m": [1, 2]}}, r"start\.position_m: expected 3 values, not \[1, 2\]"),
     ({"depth": {"sigma_m": -1}}, r"depth\.sigma_m: .* greater than 0"),
     ({"imu": False}, r"imu: expected a section, \[imu\] in TOML, not false$"),
-    (
-        {"heading": False},
-        r"heading: .* not false; to leave heading unused: use = false under \[heading\] in the log",
-    ),
-    (
-        {"heading": {"bias_sigma_rad": False}},
-        r"heading\.bias_sigma_rad: expected a number, not false$",
-    ),
-]
+    ({"heading": False}, r"heading: .* not false; to leave heading unused: use = false under \[heading\] in the log"),
+    ({"heading": {"bias_sigma_rad": False}}, r"heading\.bias_sigma_rad: expected a number, not false$"),
+]  # fmt: skip
 BROKEN_RECORDS: list[tuple[dict[str, str], type[Exception], str]] = [
     ({"calibration": "{"}, LogError, "calibration is not JSON"),
     ({"calibration": '{"imu": {"nonsense": 1}}'}, CalibrationError, "imu.nonsense"),

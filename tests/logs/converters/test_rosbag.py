@@ -168,7 +168,7 @@ def test_input_beyond_the_limit_of_unpacking_is_refused(
         (lz4.frame.compress, limited_lz4),
         (zstandard.compress, limited_zstd),
     ],
-)
+)  # fmt: skip
 def test_a_chunk_that_is_cut_off_is_no_chunk(pack, unpack):
     content = np.random.default_rng(0).bytes(300_000)
     packed = pack(content)
@@ -215,28 +215,12 @@ def test_without_the_library_the_command_that_installs_it_is_named(
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        (
-            "broken.bag",
-            b"#ROSBAG V2.0\nnonsense",
-            r"broken\.bag cannot be read as a bag.*rosbag reindex",
-        ),
-        (
-            "text.txt",
-            b"hello",
-            r"text\.txt is no bag but a text that begins with 'hello'; give a ROS 1 \.bag",
-        ),
-        (
-            "a.mcap",
-            b"\x89MCAP0\r\n",
-            r"a\.mcap is already an MCAP file: .* `sonar-graph inspect .*a\.mcap`",
-        ),
-        (
-            "a.bag",
-            b"\x89MCAP0\r\n",
-            r"a\.bag is already an MCAP file: read it directly",
-        ),
+        ("broken.bag", b"#ROSBAG V2.0\nnonsense", r"broken\.bag cannot be read as a bag.*rosbag reindex"),
+        ("text.txt", b"hello", r"text\.txt is no bag but a text that begins with 'hello'; give a ROS 1 \.bag"),
+        ("a.mcap", b"\x89MCAP0\r\n", r"a\.mcap is already an MCAP file: .* `sonar-graph inspect .*a\.mcap`"),
+        ("a.bag", b"\x89MCAP0\r\n", r"a\.bag is already an MCAP file: read it directly"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(LogError, match=message):
