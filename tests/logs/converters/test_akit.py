@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Slerp
 
 from sonar_graph.logs.convert import read_akit
 
@@ -76,3 +78,29 @@ def test_the_start_is_where_a_reference_that_is_late_turns_as_the_gyros_do(tmp_p
         assert abs((first_s - late_s + 0.5) % 1.0 - 0.5) < 0.005
     # farther than tried
     assert reference(2.0).truth.stamps_ns[0] == 0
+
+
+@pytest.mark.recording
+@pytest.mark.parametrize("number", [1, 3, 7])
+def test_dvl_measures_the_references_velocity_behind_its_origin(unpacked, number):
+    """By its leftward part; the reference lags the IMU by a time that differs between trajectories."""
+    folder = next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent
+    sequence = read_akit(folder, number)
+    knots = sequence.truth.stamps_ns * 1e-9
+    position = CubicSpline(knots, sequence.truth.positions)
+    attitude = Slerp(knots, sequence.truth.rotations())
+    dvl = sequence.dvl.rows(np.arange(5, 395))
+
+    def sideways_error(lever, delay_s=0.0):
+        seconds = dvl.stamps_ns * 1e-9 + delay_s
+        rows = np.round(seconds * 100).astype(int) + np.arange(-10, 11)[:, None]
+        rate = sequence.imu.angular_velocity[rows].mean(axis=0)
+        expected = attitude(seconds).inv().apply(position(seconds, 1))
+        expected += np.cross(rate, lever)
+        return np.std(dvl.velocity[:, 1] - expected[:, 1])
+
+    lever = sequence.calibration.dvl.mounting.translation_m
+    right = sideways_error(lever)
+    assert right < 0.06
+    assert right < 0.6 * sideways_error(np.zeros(3))
+    assert right < 0.6 * sideways_error(lever, -1.0)
