@@ -83,28 +83,22 @@ def test_every_message_is_found_whatever_the_container(path, options):
     assert read(path) == written
     calls: list[tuple[int, int]] = []
     recording = scan(
-        path,
-        lambda _: Keep.STAMP,
-        progress=lambda done, total: calls.append((done, total)),
+        path, lambda _: Keep.STAMP, progress=lambda *call: calls.append(call)
     )
     assert list(recording.topics) == ["/bytes", "/json"]
     assert recording.metadata == {"sonar_graph": {"name": "x"}}
-    assert (recording.ending, recording.corrupt, recording.damage.remarks) == (
-        None,
-        [],
-        [],
-    )
-    assert len(recording.topics["/bytes"]) == len(written)
-    # only the stamps were wanted
-    assert list(recording.topics["/bytes"].stacks) == [12]
+    assert recording.ending is None
+    assert recording.corrupt == recording.damage.remarks == []
+    found = recording.topics["/bytes"]
+    assert len(found) == len(written)
+    assert list(found.stacks) == [12]  # only the stamps were wanted
     assert calls == sorted(calls) != []
     assert {total for _, total in calls} <= {path.stat().st_size}
     pieces: dict[str, list[Stored]] = {}
     for piece in stream(path, lambda _: Keep.ALL):
         pieces.setdefault(piece.name, []).extend(entries(piece))
-    assert pieces == {
-        name: entries(topic) for name, topic in scan_all(path).topics.items()
-    }
+    topics = scan_all(path).topics
+    assert pieces == {name: entries(topic) for name, topic in topics.items()}
 
 
 # ---- damage

@@ -56,12 +56,12 @@ def detection(
 ) -> dict[str, Any]:
     covariance = (np.eye(6) * variance).ravel().tolist()
     pose = {"pose": {"position": vector(*position)}, "covariance": covariance}
-    centre = {"position": vector(position[0] + 10, *position[1:])}
-    results_ = [
-        {"hypothesis": {"class_id": name, "score": score}, "pose": pose}
-        for name, score in results
-    ]
-    return {"results": results_, "bbox": {"center": centre}, "id": "track"}
+    hypotheses = [{"class_id": name, "score": score} for name, score in results]
+    return {
+        "results": [{"hypothesis": one, "pose": pose} for one in hypotheses],
+        "bbox": {"center": {"position": vector(position[0] + 10, *position[1:])}},
+        "id": "track",
+    }
 
 
 def arrays(*frames: list[dict[str, Any]]) -> Entry:

@@ -23,21 +23,16 @@ def dive(imu_hz: float = 50.0, every: int = 10) -> SimpleNamespace:
     rng = np.random.default_rng(7)
     s = np.arange(ROWS) / imu_hz
     slow = s[::every]
-    turns = np.sin(slow), np.cos(slow), np.sin(2 * slow)
+    turns = np.column_stack([np.sin(slow), np.cos(slow), np.sin(2 * slow)])
     return SimpleNamespace(
         s=s,
         slow=slow,
         rate=rng.normal(0, 0.1, (ROWS, 3)),
         force=rng.normal([0, 0, 9.81], 0.05, (ROWS, 3)),
-        velocity=np.column_stack(turns) * [0.3, 0.1, 0.05] + [0.8, 0, 0],
+        velocity=turns * [0.3, 0.1, 0.05] + [0.8, 0, 0],
         depth=4 + np.sin(0.3 * slow),
         bearing=(300 + 40 * np.sin(0.5 * slow)) % 360,
     )
-
-
-@pytest.fixture
-def d() -> SimpleNamespace:
-    return dive()
 
 
 def write(
@@ -79,6 +74,11 @@ def assert_is(sequence, dive: SimpleNamespace) -> None:
         (-sequence.depth.z_m, dive.depth),
     ):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.fixture
+def d() -> SimpleNamespace:
+    return dive()
 
 
 @pytest.fixture

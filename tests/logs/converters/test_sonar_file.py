@@ -69,13 +69,10 @@ def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
 # ---- damage
 
 
-def patched(frames: Frames, which_one: int, at: int, value: bytes) -> Frames:
-    frame = frames[which_one]
-    return [
-        *frames[:which_one],
-        frame[:at] + value + frame[at + len(value) :],
-        *frames[which_one + 1 :],
-    ]
+def patched(frames: Frames, number: int, at: int, value: bytes) -> Frames:
+    frame = frames[number]
+    frame = frame[:at] + value + frame[at + len(value) :]
+    return [*frames[:number], frame, *frames[number + 1 :]]
 
 
 def flipped(frames: Frames, which_one: int, at: int, bit: int) -> Frames:
