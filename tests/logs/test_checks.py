@@ -411,7 +411,7 @@ def test_two_imus_on_one_topic_are_named_and_gravity_is_not_missing():
     assert "two IMUs" in found
 
 
-def test_a_yaw_that_stands_still_in_an_orientation_that_tilts_repeats_itself():
+def test_a_yaw_that_stands_still_while_the_vehicle_tilts_repeats_itself():
     """Yaw of quaternions whose roll changes is the same but for rounding."""
     yaw = np.minimum(np.linspace(0.5, 1.5, 200), 1.0)
     angles = np.column_stack([yaw, 0 * yaw, np.linspace(0.0, 0.3, 200)])

@@ -57,7 +57,7 @@ REFUSALS: dict[str, Refusal] = {
         r"log\.toml: \[dvl\] velocity: .* has no field velocit\[0\]; did you mean velocity[?] it has: timestamp"),
     "no common time": (
         [imu(ROWS), ("/dvl", "marine_acoustic_msgs/msg/Dvl", LATER)], "",
-        r'IMU from \d.* s, DVL from \d.*no common time; .*stamp = "log" under .* See stamp, stamp_unit_s and stamp_offset_s'),
+        r'IMU from \d.* DVL from \d.*no common time; .*stamp = "log" under .* See stamp, stamp_unit_s and stamp_offset_s'),
     "stamps of a boot in microseconds": (
         [imu(ROWS), STAMPED], STAMPED_TABLE + 'stamp = "time"',
         r'no common time; .* Perhaps stamp_unit_s = "us" under \[dvl\]'),
