@@ -34,10 +34,8 @@ TYPES = {
     "imu": "sensor_msgs/msg/Imu",
     "dvl": "marine_acoustic_msgs/msg/Dvl",
     "pressure": "sensor_msgs/msg/FluidPressure",
-    "depth": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "odometry": "nav_msgs/msg/Odometry",
     "detections": "sonar_graph_msgs/msg/LandmarkDetections",
-    "map": "sonar_graph_msgs/msg/LandmarkMap",
 }
 Entry = tuple[Any, ...]
 """Topic, type or a word for it, messages, and the definition where it is not the usual one."""
@@ -78,22 +76,16 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def imu(
-        self, ns: int, rate: tuple[float, ...] = (0, 0, 0.1), **other: Any
-    ) -> dict[str, Any]:
-        message = {"header": header(ns, "imu_link"), "angular_velocity": vector(*rate)}
-        message["linear_acceleration"] = vector(0.1, 0.2, 9.8)
-        return message | other
-
-    def dvl(
-        self, ns: int, velocity: tuple[float, ...] = (0.5, 0, 0), **other: Any
-    ) -> dict[str, Any]:
-        message = {
-            "header": header(ns, "dvl_link"),
-            "velocity": vector(*velocity),
-            "velocity_mode": 1,
+    def imu(self, ns: int, rate: tuple[float, ...] = (0, 0, 0.1)) -> dict[str, Any]:
+        return {
+            "header": header(ns, "imu_link"),
+            "angular_velocity": vector(*rate),
+            "linear_acceleration": vector(0.1, 0.2, 9.8),
         }
-        return message | {"num_good_beams": 4} | other
+
+    def dvl(self, ns: int) -> dict[str, Any]:
+        message = {"header": header(ns, "dvl_link"), "velocity": vector(0.5, 0, 0)}
+        return message | {"velocity_mode": 1, "num_good_beams": 4}
 
     def pressure(self, ns: int) -> dict[str, Any]:
         return {"header": header(ns, "pressure_link"), "fluid_pressure": 2e5}
@@ -106,20 +98,20 @@ class Bench:
         self, ns: int, ranges: list[float], ids: list[int], track: tuple[int, ...] = ()
     ) -> dict[str, Any]:
         count = len(ranges)
-        message = {
+        share = min(0.5, count / max(len(ids), 1))
+        return {
             "header": header(ns, "sonar_link"),
             "range_m": ranges,
             "azimuth_rad": [0.1] * count,
-        }
-        message |= {"covariance": [0.01, 0, 0, 0.02] * count, "candidate_ids": ids}
-        return message | {
-            "id_probability": [min(0.5, len(ranges) / max(len(ids), 1))] * len(ids),
+            "covariance": [0.01, 0, 0, 0.02] * count,
+            "candidate_ids": ids,
+            "id_probability": [share] * len(ids),
             "track": list(track),
         }
 
     def basics(self, samples: int = 5) -> list[Entry]:
         """The topics that every log needs."""
-        stamps = [T0_NS + i * 10**8 for i in range(samples)]
+        stamps = [self.t0_ns + i * 10**8 for i in range(samples)]
         return [
             ("/imu", "imu", [self.imu(s) for s in stamps]),
             ("/dvl", "dvl", [self.dvl(s) for s in stamps]),
@@ -127,21 +119,18 @@ class Bench:
 
     def write(self, *entries: Entry, name: str = "log.mcap") -> Path:
         """A log of ten messages a second on each topic."""
-        with (self._folder / name).open("wb") as stream:
+        path = self._folder / name
+        with path.open("wb") as stream:
             writer = Writer(stream)
             for topic, word, messages, *text in entries:
                 kind = TYPES.get(word, word)
-                said = (
-                    text[0] if text else self.definitions.get(kind) or definition(kind)
-                )
-                schema = writer.register_msgdef(kind, said)
+                text = text or [self.definitions.get(kind) or definition(kind)]
+                schema = writer.register_msgdef(kind, *text)
                 for i, message in enumerate(messages):
-                    time_ns = self.t0_ns + i * 10**8
-                    writer.write_message(
-                        topic, schema, message, log_time=time_ns, publish_time=time_ns
-                    )
+                    at_ns = self.t0_ns + i * 10**8
+                    writer.write_message(topic, schema, message, at_ns, at_ns)
             writer.finish()
-        return self._folder / name
+        return path
 
 
 @pytest.fixture
@@ -159,11 +148,6 @@ def decode(path: Path, *topics: str) -> dict[str, list[Any]]:
     return found
 
 
-@pytest.fixture
-def decoded() -> Callable[[Path], dict[str, list[Any]]]:
-    return decode
-
-
 @pytest.fixture(scope="session")
 def make_sequence() -> Callable[..., Sequence]:
     return sequence_with
@@ -172,48 +156,38 @@ def make_sequence() -> Callable[..., Sequence]:
 def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequence:
     """Every field filled with different numbers; some covariances known, some not."""
     rng = np.random.default_rng(seed)
+    row = np.arange(samples)
     stamps = T0_NS + np.sort(rng.choice(10**10, samples, replace=False))
-    covs = rng.normal(size=(samples, 3, 3))
+
+    def normal(*shape: int) -> Any:
+        return rng.normal(size=(samples, *shape))
+
+    covs = normal(3, 3)
     covs = covs @ covs.transpose(0, 2, 1)
     covs[::3] = np.nan
-    force = rng.normal(size=(samples, 3))
+    force = normal(3)
     force[::4] = np.nan
-    frames = np.sort(rng.choice(stamps, samples))
-    quaternions = rng.normal(size=(samples, 4))
+    quaternions = normal(4)
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    calibration = Calibration(
-        imu=ImuCalibration(
-            mounting=Mounting(translation_m=(0.1, 0.2, 0.3), rpy_rad=(0.1, 0, 1))
-        )
-    )
+    mounting = Mounting(translation_m=(0.1, 0.2, 0.3), rpy_rad=(0.1, 0, 1))
     return Sequence(
         name="a name with spaces and ψ",
-        calibration=calibration,
-        imu=Imu(stamps, rng.normal(size=(samples, 3)), force),
-        dvl=Dvl(stamps, rng.normal(size=(samples, 3)), covs),
-        depth=Depth(
-            stamps,
-            rng.normal(size=samples),
-            np.where(np.arange(samples) % 2, np.nan, 0.01),
-        ),
-        heading=Heading(
-            stamps,
-            10 * rng.normal(size=samples),
-            np.where(np.arange(samples) % 3, 0.1, np.nan),
-        ),
-        positions=PositionFixes(stamps, rng.normal(size=(samples, 3)), covs),
+        calibration=Calibration(imu=ImuCalibration(mounting=mounting)),
+        imu=Imu(stamps, normal(3), force),
+        dvl=Dvl(stamps, normal(3), covs),
+        depth=Depth(stamps, normal(), np.where(row % 2, np.nan, 0.01)),
+        heading=Heading(stamps, 10 * normal(), np.where(row % 3, 0.1, np.nan)),
+        positions=PositionFixes(stamps, normal(3), covs),
         detections=LandmarkDetections(
-            frames,
+            np.sort(rng.choice(stamps, samples)),
             rng.uniform(1, 5, samples),
-            rng.normal(size=samples),
-            rng.normal(size=(samples, 2, 2)),
+            normal(),
+            normal(2, 2),
             rng.integers(-1, 9, (samples, candidates)),
             rng.uniform(0, 1 / candidates, (samples, candidates)),
-            np.arange(samples) % 4 - 1 + 10**12 * (np.arange(samples) % 2),
+            row % 4 - 1 + 10**12 * (row % 2),
         ),
-        truth=Trajectory.without_covariances(
-            stamps, rng.normal(size=(samples, 3)), quaternions
-        ),
+        truth=Trajectory.without_covariances(stamps, normal(3), quaternions),
         true_landmarks=LandmarkMap(
             np.array([3, 7]), rng.normal(size=(2, 3)), np.full((2, 3, 3), np.nan)
         ),
@@ -236,17 +210,6 @@ def writing(
         writer.start(profile, "test")
         yield writer
         writer.finish()
-
-
-def channel_for(
-    writer: ContainerWriter,
-    topic: str,
-    kind: str = "test_msgs/msg/Bytes",
-    text: bytes = BYTES_TEXT,
-) -> int:
-    return writer.register_channel(
-        topic, "cdr", writer.register_schema(kind, "ros2msg", text)
-    )
 
 
 def write(
@@ -291,22 +254,22 @@ def copy(
         seen[topic] += 1
         if topic not in channels and schema is not None:
             kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-            channels[topic] = writer.register_channel(
-                topic, channel.message_encoding, kind, channel.metadata
-            )
+            about = channel.message_encoding, kind, channel.metadata
+            channels[topic] = writer.register_channel(topic, *about)
         if data is not None:
-            times = (message.publish_time, message.sequence)
+            times = message.publish_time, message.sequence
             writer.add_message(channels[topic], message.log_time, data, *times)
 
 
 def write_apart(path: Path, count: int = 100) -> None:
     """/a and /b in chunks of their own, by turns, a second apart from second 1 on; /tf_static is in the first chunk."""
     with writing(path) as writer:
-        kinds = {"/a": "A", "/b": "B", "/tf_static": "Static"}
-        channels = [
-            channel_for(writer, name, f"test_msgs/msg/{kind}")
-            for name, kind in kinds.items()
-        ]
+        channels = []
+        for topic in ("/a", "/b", "/tf_static"):
+            kind = writer.register_schema(
+                f"test_msgs/msg/{topic[1:]}", "ros2msg", BYTES_TEXT
+            )
+            channels.append(writer.register_channel(topic, "cdr", kind))
         writer.add_message(channels[2], 10**9, b"static", 10**9)
         for i in range(count):
             writer.add_message(channels[i % 2], (1 + i) * 10**9, bytes([i]), 10**9)
@@ -315,11 +278,14 @@ def write_apart(path: Path, count: int = 100) -> None:
 
 def entries(topic: Topic) -> list[Stored]:
     """Log times and payloads, in order."""
-    stacks = [part for stack in topic.stacks.values() for part in stack]
     payloads = {
-        row: p.tobytes() for rows, ps in stacks for row, p in zip(rows, ps, strict=True)
+        row: payload.tobytes()
+        for stacks in topic.stacks.values()
+        for stack in stacks
+        for row, payload in zip(*stack, strict=True)
     }
-    return [(int(time), payloads[row]) for row, time in enumerate(topic.log_times_ns)]
+    times_ns = topic.log_times_ns.tolist()
+    return [(time_ns, payloads[row]) for row, time_ns in enumerate(times_ns)]
 
 
 def scan_all(path: Path, window: TimeWindow | None = None) -> Recording:
@@ -343,3 +309,7 @@ def flip(path: Path, at: int, bit: int = 4) -> None:
     content = bytearray(path.read_bytes())
     content[at] ^= bit
     path.write_bytes(content)
+
+
+def cut(path: Path, at: int) -> None:
+    path.write_bytes(path.read_bytes()[:at])

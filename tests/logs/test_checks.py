@@ -1,5 +1,6 @@
 """Checks of a log's numbers: each fault x the sentence about it, and whole logs without a sentence."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,11 +45,8 @@ def stamps(times_s: Floats) -> Any:
 
 
 def imu(times_s: Floats = SAMPLES, force: tuple[float, ...] = (0, 0, 9.8)) -> Imu:
-    return Imu(
-        stamps(times_s),
-        np.zeros((len(times_s), 3)),
-        np.tile(force, (len(times_s), 1)).astype(float),
-    )
+    count = len(times_s)
+    return Imu(stamps(times_s), np.zeros((count, 3)), np.tile(force, (count, 1)) * 1.0)
 
 
 def dvl(times_s: Floats = PINGS, partial: Any = False) -> Dvl:
@@ -99,16 +97,14 @@ GAPS: dict[str, tuple[Imu, Dvl, Calibration, list[str]]] = {
         f"imu: no sample 100.000 to 110.000 s after the start: {GUESS}, and counts as measured"]),
     "slower": (imu(SLOWER), dvl(), USUAL, ["imu: no sample in 5 gaps of 1.0 s together, the longest"]),
     "used part of holes": (imu(without(SAMPLES, (5, 7), (9, 11), (290, 291))), dvl(PINGS[50:1449]), USUAL, [
-        "Doppler log begins 10.0 s after the IMU", "Doppler log ends", "imu: no sample 0.000 to 1.000 s after the"]),
+        "Doppler log begins 10.0 s after the IMU; not estimated until then",
+        "Doppler log ends 10.4 s before the IMU; not estimated from there", "imu: no sample 0.000 to 1.000 s after the"]),
     "many": (HOLES, dvl(), USUAL, [
         "imu: no sample in 6 gaps of 2.1 s together, the longest 40.000 to 40.400, 50.000 to 50.500, 60.000 to 60.6"]),
     "begins late": (imu(SAMPLES[300:29000]), dvl(PINGS[:1451]), HELD, [
         "IMU begins 3.0 s after the Doppler log; not estimated until then"]),
     "ends early": (imu(SAMPLES[:28001]), dvl(PINGS[:1451]), USUAL, [
         "IMU ends 10.0 s before the Doppler log; not estimated from there"]),
-    "both ends": (imu(SAMPLES[:29001]), dvl(PINGS[20:1401]), USUAL, [
-        "Doppler log begins 4.0 s after the IMU; not estimated until then",
-        "Doppler log ends 10.0 s before the IMU; not estimated from there"]),
 }
 # fmt: on
 
@@ -157,7 +153,6 @@ FIRST = np.arange(100)
             EVEN,
             "3 messages without a stamp: the time of recording is used",
         ),
-        (np.where(FIRST < 1, 0, EVEN), EVEN, "1 message without a stamp"),
         (EVEN[np.r_[:50, 52, 50:52, 53:100]], EVEN, "once backwards, by 0.2 s at most"),
         (
             EVEN[np.r_[1, 0, 2:50, 51, 50, 52:100]],
@@ -222,31 +217,31 @@ def test_only_single_wild_rates_are_spikes(rate, expected):
 
 def test_a_coarse_height_repeats_itself_and_one_that_hangs_is_stuck():
     rng = np.random.default_rng(4)
-    stamps_ns = EVEN[0] + np.arange(1500) * SECOND // 5
-    way = 0.5 * (stamps_ns - stamps_ns[0]) * 1e-9
+    stamps_ns = stamps(PINGS)
     fine = 3.0 + np.cumsum(0.003 * rng.standard_normal(1500))[:, None]
+
+    def warning(height: Floats, speed_m_s: float = 0.5) -> str:
+        return stuck_warning(stamps_ns, height, "height", speed_m_s * PINGS) or ""
+
     for step_m, hangs_s in ((1e-4, 5.0), (0.01, 60.0)):
         height = np.round(fine / step_m) * step_m
-        assert stuck_warning(stamps_ns, height, "height", way) is None
+        assert not warning(height)
         height[500 : 500 + round(5 * hangs_s)] = height[500]
-        assert "height the same to the last bit" in (
-            stuck_warning(stamps_ns, height, "height", way) or ""
-        )
+        assert "height the same to the last bit" in warning(height)
     # a vehicle that rests has one depth, but for the resolution
-    assert stuck_warning(stamps_ns, height, "height", 0.04 * way) is None
-    assert "in 1500 rows" in (
-        stuck_warning(stamps_ns, 0 * fine + 3.0, "height", way) or ""
-    )
+    assert not warning(height, 0.02)
+    assert "in 1500 rows" in warning(0 * fine + 3.0)
 
 
-def moving(*stretches: tuple[slice, Any]) -> Floats:
+def moving(*stretches: tuple[int, int, Any]) -> Floats:
+    """Rows that change, but for stretches from a row to another."""
     values = np.random.default_rng(0).standard_normal((300, 3))
-    for where, value in stretches:
-        values[where] = value
+    for first, end, value in stretches:
+        values[first:end] = value
     return values
 
 
-ZEROS = [(slice(60 + 40 * k, 80 + 41 * k), 0.0) for k in range(5)]
+ZEROS = [(60 + 40 * k, 80 + 41 * k, 0.0) for k in range(5)]
 
 
 @pytest.mark.parametrize(
@@ -255,14 +250,14 @@ ZEROS = [(slice(60 + 40 * k, 80 + 41 * k), 0.0) for k in range(5)]
         (moving(), 10, []),
         (np.zeros((1, 3)), 10, []),
         (np.column_stack([np.zeros((300, 2)), moving()[:, 2]]), 10, []),  # a vehicle in the plane
-        (moving((slice(100, 111), 0.0)), 10, []),
-        (moving((slice(100, 104), 0.0)), 1, []),
-        (moving((slice(100, 112), 0.0)), 10, ["velocity exactly zero in 12 rows, "]),
-        (moving((slice(100, 105), 0.0)), 1, ["in 5 rows, 100.000 to 104.000 s"]),
-        (moving((slice(100, 131), (0.4, 0, -0.1))), 10,
+        (moving((100, 111, 0.0)), 10, []),
+        (moving((100, 104, 0.0)), 1, []),
+        (moving((100, 112, 0.0)), 10, ["velocity exactly zero in 12 rows, "]),
+        (moving((100, 105, 0.0)), 1, ["in 5 rows, 100.000 to 104.000 s"]),
+        (moving((100, 131, (0.4, 0, -0.1))), 10,
          ["velocity the same to the last bit in 31 rows, 10.000 to 13.000 s after the first: used as measured"]),
-        (moving((slice(20), 0.0), (slice(270, 300), 0.0)), 10, ["in 50 rows, 0.000 to 1.900, 27.000 to 29.900 s"]),
-        (moving((slice(10, 40), 1.0), *ZEROS), 10,
+        (moving((0, 20, 0.0), (270, 300, 0.0)), 10, ["in 50 rows, 0.000 to 1.900, 27.000 to 29.900 s"]),
+        (moving((10, 40, 1.0), *ZEROS), 10,
          ["exactly zero in 110 rows of 5 stretches, the longest 14.000 to 16.100, 18.000 to 20.200, 22.000 to",
           "and the same to the last bit in 30 rows, 1.000 to 3.900 s after the first"]),
     ],
@@ -276,20 +271,18 @@ def test_equal_rows_of_more_than_a_second_and_five_rows_are_named(
 
 
 EVERY_TENTH_S = stamps(np.arange(300) / 10)
-
-
-STOPPED = moving((slice(100, 200), 0.3))
+STOPPED = moving((100, 200, 0.3))
 
 
 @pytest.mark.parametrize(
     ("quantity", "values", "others", "is_stuck"),
     [
         ("angular rate", STOPPED, moving(), True),
-        ("angular rate", moving((slice(100, 200), 0.0)), moving(), True),
+        ("angular rate", moving((100, 200, 0.0)), moving(), True),
         ("velocity", STOPPED, moving(), True),
-        ("velocity", moving((slice(100, 200), 0.0)), moving(), False),  # at rest
-        ("velocity", STOPPED, moving((slice(120, 160), 0.1)), False),  # a simulator at rest
-        ("velocity", moving((slice(100, 120), 0.3)), moving(), False),  # 2 s
+        ("velocity", moving((100, 200, 0.0)), moving(), False),  # at rest
+        ("velocity", STOPPED, moving((120, 160, 0.1)), False),  # a simulator at rest
+        ("velocity", moving((100, 120, 0.3)), moving(), False),  # 2 s
     ],
 )  # fmt: skip
 def test_a_quantity_that_repeats_while_others_change_is_stuck(
@@ -307,22 +300,20 @@ def test_a_quantity_that_repeats_while_others_change_is_stuck(
 def test_frames_that_repeat_while_the_vehicle_moves_are_stuck():
     """Three sightings a frame; the frames from the tenth on repeat it, or only its azimuth."""
     frame = np.repeat(np.arange(40), 3)
+    is_later = frame > 9
     seen = np.random.default_rng(1).uniform(1.0, 9.0, (120, 2))
-    way_m = 0.1 * frame
-    repeated = seen.copy()
-    repeated[30:] = np.tile(seen[27:30], (30, 1))
-    held = seen.copy()
-    held[30:, 1] = 0.4
-    later = frame > 9
-    assert not repeated_sightings(frame, seen, way_m, 0.5).any()
-    np.testing.assert_array_equal(
-        repeated_sightings(frame, repeated, way_m, 0.5), later
-    )
+    repeated = np.concatenate([seen[:30], np.tile(seen[27:30], (30, 1))])
+    held = np.where(is_later[:, None] * [False, True], 0.4, seen)
     # the first of the equal ones may be measured
-    np.testing.assert_array_equal(
-        repeated_sightings(frame, held, way_m, 0.5), later & (np.arange(120) > 30)
-    )
-    assert not repeated_sightings(frame, repeated, 0.01 * way_m, 0.5).any()
+    is_held = is_later & (np.arange(120) > 30)
+    for sightings, step_m, expected in (
+        (seen, 0.1, is_later & False),
+        (repeated, 0.1, is_later),
+        (held, 0.1, is_held),
+        (repeated, 0.001, is_later & False),
+    ):
+        found = repeated_sightings(frame, sightings, step_m * frame, 0.5)
+        np.testing.assert_array_equal(found, expected)
 
 
 # --- enough for an estimator ----------------------------------------------------------------------------------------
@@ -332,9 +323,6 @@ def test_one_common_instant_is_enough_and_one_whole_velocity():
     five = np.arange(5.0)
     require_use("log.mcap", imu(five), dvl(five + 4))
     require_use("log.mcap", imu(five), dvl(five, five != 3))
-    spans = r"log\.mcap: IMU from 1000\.000 to 1004\.000 s, DVL from 4600\.000 to 4604\.000 s: no common time"
-    with pytest.raises(LogError, match=spans):
-        require_use("log.mcap", imu(five), dvl(five + 3600))
     with pytest.raises(LogError, match=r"none of its 5 rows measures a velocity in"):
         require_use("log.mcap", imu(five), dvl(five, True))
 
@@ -382,11 +370,11 @@ def test_a_faulty_axis_is_named_and_none_of_a_whole_sensor(fault, seed):
 
 @pytest.mark.parametrize("has_depth", [True, False])
 def test_a_constant_vertical_velocity_of_a_diving_vehicle_is_doubted(has_depth):
-    t = np.arange(2000) * 0.02
-    imu = Imu(stamps(t), rates(0), np.tile([0.0, 0.0, 9.8], (2000, 1)))
-    dvl = Dvl(stamps(t), rates(1, dead=2), np.tile(1e-4 * np.eye(3), (2000, 1, 1)))
-    depth = Depth(stamps(t), -5 + np.sin(t), np.full(2000, 1e-4)) if has_depth else None
-    found = list(axis_doubts(imu, dvl, depth, Calibration()))
+    t = SAMPLES[:2000]
+    turning = replace(imu(t), angular_velocity=rates(0))
+    level = replace(dvl(t), velocity=rates(1, dead=2))
+    depth = Depth(stamps(t), np.sin(t), np.full(2000, 1e-4)) if has_depth else None
+    found = list(axis_doubts(turning, level, depth, USUAL))
     assert len(found) == has_depth
     assert all(text.startswith("dvl: velocity along z is 0") for text in found)
 
@@ -417,21 +405,17 @@ def test_zeros_far_from_the_rows_beside_them_are_no_measurements():
 
 
 def test_two_imus_on_one_topic_are_named_and_gravity_is_not_missing():
-    force = np.tile([0.0, 0.0, 9.8], (len(EVEN), 1))
-    force[::2] *= -1.0
-    both = Imu(EVEN, np.zeros_like(force), force)
-    (found,) = row_doubts(both, None, None, Calibration())
+    both = imu()
+    both.specific_force[::2] *= -1.0
+    (found,) = row_doubts(both, None, None, USUAL)
     assert "two IMUs" in found
 
 
-def test_a_yaw_that_stands_still_in_an_orientation_that_tilts_repeats_itself():
+def test_a_yaw_that_stands_still_while_the_vehicle_tilts_repeats_itself():
     """Yaw of quaternions whose roll changes is the same but for rounding."""
-    roll = np.linspace(0.0, 0.3, 200)
-    yaw = np.full(200, 1.0)
-    yaw[:100] += np.linspace(-0.5, 0.0, 100)
-    angles = np.column_stack([yaw, np.zeros(200), roll])
-    turned = Rotation.from_euler("ZYX", angles).as_quat()
-    read = Rotation.from_quat(turned).as_euler("ZYX")[:, :1]
+    yaw = np.minimum(np.linspace(0.5, 1.5, 200), 1.0)
+    angles = np.column_stack([yaw, 0 * yaw, np.linspace(0.0, 0.3, 200)])
+    read = Rotation.from_euler("ZYX", angles).as_euler("ZYX")[:, :1]
     assert np.unique(read[100:]).size > 1
     found = repeats(read, moved=np.linspace(0.0, 4.0, 200), least=0.2)
     assert found[101:].all()

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,11 +19,11 @@ from sonar_graph.files import text_of
 from sonar_graph.files.inputs import LARGEST_TEXT
 from sonar_graph.logs import PartialCalibration, inspect_log, read_log
 from sonar_graph.logs.cdr import parse_definition
-from sonar_graph.logs.mcap import Keep, chunks, scanning, write_recording
+from sonar_graph.logs.mcap import chunks, scanning, write_recording
 from sonar_graph.logs.mcap.foreign_files import MCAP_MAGIC
 from sonar_graph.logs.writing import imu_messages
 
-from .conftest import tree
+from .conftest import scan_all, tree
 
 LIMIT = 1 << 16
 PACK: dict[str, Callable[[bytes], bytes]] = {
@@ -44,56 +45,45 @@ def log_with_chunk(path: Path, content: bytes, compression: str, size: int) -> P
 
 @pytest.mark.parametrize("compression", PACK)
 @pytest.mark.parametrize(
-    ("size", "stated"),
-    [(LIMIT, LIMIT), (LIMIT + 1, LIMIT + 1), (LIMIT + 1, 9), (9, 2**62)],
+    ("size", "stated", "reason"),
+    [
+        (LIMIT, LIMIT, "unread"),  # zeros are no records
+        (LIMIT + 1, LIMIT + 1, rf"{LIMIT}.*mcap compress"),
+        (LIMIT + 1, 9, "is lost"),
+        (9, 2**62, "is lost"),
+    ],
 )
 def test_a_chunk_beyond_the_limit_is_lost_before_it_is_unpacked(
-    tmp_path,
-    monkeypatch,
-    compression,
-    size,
-    stated,
+    tmp_path, monkeypatch, compression, size, stated, reason
 ):
     monkeypatch.setattr(chunks, "LARGEST_BYTES", LIMIT)
     path = log_with_chunk(tmp_path / "log.mcap", bytes(size), compression, stated)
-    (loss,) = scanning.scan(path, lambda _: Keep.ALL).damage.losses
-    if (size, stated) == (LIMIT, LIMIT):
-        assert "unread" in loss.reason  # zeros are no records
-    elif size > LIMIT and stated > LIMIT:
-        assert str(LIMIT) in loss.reason
-        assert "mcap compress" in loss.reason
-    else:
-        assert "is lost" in loss.reason
+    (loss,) = scan_all(path).damage.losses
+    assert re.search(reason, loss.reason)
 
 
 def test_messages_far_larger_than_their_file_are_refused(
     tmp_path, monkeypatch, make_sequence
 ):
-    write_recording(
-        tmp_path / "log.mcap", [imu_messages("/imu", make_sequence().imu)], {}
-    )
-    size = (tmp_path / "log.mcap").stat().st_size
+    path = tmp_path / "log.mcap"
+    write_recording(path, [imu_messages("/imu", make_sequence().imu)], {})
+    size = path.stat().st_size
     monkeypatch.setattr(scanning, "LARGEST_BYTES", 10)
-    scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+    scan_all(path)
     monkeypatch.setattr(scanning, "LARGEST_RATIO", 1 / size)
-    with pytest.raises(
-        LogError, match=rf"its {size} bytes unpack to more than .* --start and --end"
-    ):
-        scanning.scan(tmp_path / "log.mcap", lambda _: Keep.ALL)
+    message = rf"its {size} bytes unpack to more than .* --start and --end"
+    with pytest.raises(LogError, match=message):
+        scan_all(path)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_a_pipe_or_device_is_refused_wherever_a_file_is_read(tmp_path, kind):
     path = tmp_path / "in.mcap"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
-    for read in (read_log, inspect_log):
-        with pytest.raises(
-            LogError,
-            match=r"in\.mcap cannot be read: it is a pipe, a socket or a device",
-        ):
+    for read in (read_log, inspect_log, PartialCalibration.read):
+        message = r"in\.mcap:? cannot be read: it is a pipe, a socket or a device"
+        with pytest.raises((LogError, CalibrationError), match=message):
             read(path)
-    with pytest.raises(CalibrationError, match="it is a pipe"):
-        PartialCalibration.read(path)
 
 
 def test_a_text_that_is_too_large_is_refused_unread(tmp_path):
@@ -112,7 +102,6 @@ TRANSLATION = "numbers that are not finite"
     ("x_m", "w", "message"),
     [
         (0.0, np.nan, TRANSLATION),
-        (0.0, np.inf, TRANSLATION),
         (0.0, 0.0, ROTATION + "0"),
         (1e300, 1.0, r"dvl_link: is .* m from base_link"),
         (350.0, 1.0, r"dvl_link: is .* m from base_link: millimetres"),
@@ -127,8 +116,8 @@ def test_a_mounting_that_cannot_be_is_named_unless_the_user_states_it(
         read_log(path)
     assert any("--calibration" in text for text in inspect_log(path).unusable)
     stated = PartialCalibration.parse({"dvl": {"mounting": {}}}, "vehicle.toml")
-    calibration = read_log(path, calibration=stated).calibration
-    assert calibration.dvl.mounting.translation_m == (0.0, 0.0, 0.0)
+    mounting = read_log(path, calibration=stated).calibration.dvl.mounting
+    assert mounting.translation_m == (0.0, 0.0, 0.0)
 
 
 SLOW: dict[str, str] = {

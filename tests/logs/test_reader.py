@@ -25,6 +25,7 @@ from sonar_graph.logs.mcap.log_file import seal
 from .conftest import (
     Stored,
     chunk_indexes,
+    cut,
     entries,
     flip,
     read,
@@ -82,28 +83,22 @@ def test_every_message_is_found_whatever_the_container(path, options):
     assert read(path) == written
     calls: list[tuple[int, int]] = []
     recording = scan(
-        path,
-        lambda _: Keep.STAMP,
-        progress=lambda done, total: calls.append((done, total)),
+        path, lambda _: Keep.STAMP, progress=lambda *call: calls.append(call)
     )
     assert list(recording.topics) == ["/bytes", "/json"]
     assert recording.metadata == {"sonar_graph": {"name": "x"}}
-    assert (recording.ending, recording.corrupt, recording.damage.remarks) == (
-        None,
-        [],
-        [],
-    )
-    assert len(recording.topics["/bytes"]) == len(written)
-    # only the stamps were wanted
-    assert list(recording.topics["/bytes"].stacks) == [12]
+    assert recording.ending is None
+    assert recording.corrupt == recording.damage.remarks == []
+    found = recording.topics["/bytes"]
+    assert len(found) == len(written)
+    assert list(found.stacks) == [12]  # only the stamps were wanted
     assert calls == sorted(calls) != []
     assert {total for _, total in calls} <= {path.stat().st_size}
     pieces: dict[str, list[Stored]] = {}
     for piece in stream(path, lambda _: Keep.ALL):
         pieces.setdefault(piece.name, []).extend(entries(piece))
-    assert pieces == {
-        name: entries(topic) for name, topic in scan_all(path).topics.items()
-    }
+    topics = scan_all(path).topics
+    assert pieces == {name: entries(topic) for name, topic in topics.items()}
 
 
 # ---- damage
@@ -152,9 +147,8 @@ def in_index(offset: int) -> Callable[[Path], None]:
 def message_200(offset: int, bit: int) -> Callable[[Path], None]:
     """A bit at an offset from the head of a message outside chunks."""
     rng = np.random.default_rng(0)
-    return at_text(
-        [rng.bytes([20, 50, 80][i % 3]) for i in range(201)][200], offset - 31, bit
-    )
+    payloads = [rng.bytes([20, 50, 80][i % 3]) for i in range(201)]
+    return at_text(payloads[200], offset - 31, bit)
 
 
 def tail(content: bytes) -> Callable[[Path], object]:
@@ -188,29 +182,29 @@ FAULTS = {
     "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
     "a chunk's opcode": Fault(in_chunk(1, 0, 0x80)),
     "a chunk's size beyond all memory": Fault(huge_size, 1, SECOND),
-    "both lengths of a chunk": Fault(both_lengths, None, "", "", PLAIN),
+    "both lengths of a chunk": Fault(both_lengths, options=PLAIN),
     "bytes missing": Fault(missing_in_chunk(1, 1500), 1, "no valid record", MOVED),
     "the first chunk, with the descriptions": Fault(
         in_chunk(0, 100), 0, "chunk 1 is lost"
     ),
-    "a message index": Fault(in_index(15), None, "", "", PLAIN),
+    "a message index": Fault(in_index(15), options=PLAIN),
     "a longer message outside chunks": Fault(
-        message_200(1, 1), 200, "1 of /bytes", "", LOOSE
+        message_200(1, 1), 200, "1 of /bytes", options=LOOSE
     ),
     "a shorter message outside chunks": Fault(
-        message_200(1, 64), 200, "no valid record", "", LOOSE
+        message_200(1, 64), 200, "no valid record", options=LOOSE
     ),
     "a type's name outside chunks": Fault(
-        at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE
+        at_text(b"test_msgs/msg/Bytes"), remark=TWICE, options=LOOSE
     ),
     # it claims 29 bytes and has 13
     "a length in a description": Fault(
-        at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED
+        at_text(b"uint8[] d", -4, 16), None, "description of a ch", options=UNREPEATED
     ),
     "the length of metadata": Fault(
         at_text(b"sonar_graph", -12, 64), None, "no valid record; no messages lost"
     ),
-    "zeros after the end": Fault(tail(bytes(5000)), None, "", ENDING),
+    "zeros after the end": Fault(tail(bytes(5000)), remark=ENDING),
 } | {
     f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit))
     for at in (1, 2, 5, 8)
@@ -224,10 +218,11 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path, 
     written = write(path, **fault.options)
     chunks = chunk_indexes(path)
     lost = []
-    others = []
     if fault.lost is not None:
         lost = chunk_of(path, fault.lost) if chunks else [written[fault.lost]]
-        others = chunk_of(path, fault.lost, channel=2) if chunks else []
+    counted = {"/bytes": len(lost)}
+    if lost and chunks:
+        counted["/json"] = len(chunk_of(path, fault.lost or 0, channel=2))
     fault.damage(path)
     recording = scan_all(path)
     found = read(path)
@@ -241,24 +236,25 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path, 
         assert bool(told) == bool(expected)
         assert any(re.search(expected, text) for text in told or [""])
     assert recording.ending is None
-    assert recording.topics["/bytes"].type_name == (
-        "test_msgs/msg/Bytes" if fault.options != UNREPEATED else ""
-    )
-    if lost and not chunks:
-        (loss,) = recording.damage.losses
+    is_described = fault.options != UNREPEATED
+    kind = "test_msgs/msg/Bytes" if is_described else ""
+    assert recording.topics["/bytes"].type_name == kind
+    if not lost:
+        return
+    (loss,) = recording.damage.losses
+    if not chunks:
         assert (loss.start_ns or 0) <= lost[0][0] <= (loss.end_ns or 0)
-    if lost and chunks:
-        (loss,) = recording.damage.losses
-        assert loss.at == chunks[fault.lost or 0].chunk_start_offset
-        counted = {"/bytes": len(lost), "/json": len(others)}
-        # only a summary that fits counts the messages
-        assert loss.messages == (None if fault.remark == MOVED else counted)
-        with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: .*--salvage"):
-            recording.require_sound()
+        return
+    chunk = chunks[fault.lost or 0]
+    assert loss.at == chunk.chunk_start_offset
+    # only a summary that fits counts the messages
+    assert loss.messages == (None if fault.remark == MOVED else counted)
+    with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: .*--salvage"):
+        recording.require_sound()
     if name == "a bit in a chunk":
-        assert loss.end == chunk_end(chunks[1])
-        assert (loss.start_ns or 0) <= chunks[1].message_start_time
-        assert chunks[1].message_end_time <= (loss.end_ns or 0)
+        assert loss.end == chunk_end(chunk)
+        assert (loss.start_ns or 0) <= chunk.message_start_time
+        assert chunk.message_end_time <= (loss.end_ns or 0)
 
 
 RANDOM = settings(
@@ -305,41 +301,30 @@ def test_no_damage_makes_up_a_message_or_loses_one_silently(
         assert recording.corrupt or recording.ending
 
 
-def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(
-    path,
-):
+def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(path):
     """Without a CRC that could be checked, those of an uncompressed chunk are no messages outside chunks either."""
     write(path, chunk_size=1 << 20, compression=NONE)
     (chunk,) = chunk_indexes(path)
     both_lengths(path, 0)
-    path.write_bytes(path.read_bytes()[: chunk_end(chunk)])
+    cut(path, chunk_end(chunk))
     assert scan_all(path).topics == {}
     written = write(path)
     first, second = chunk_indexes(path)[:2]
-    path.write_bytes(path.read_bytes()[: chunk_end(second)])
+    cut(path, chunk_end(second))
     flip(path, first.chunk_start_offset + 100)
     recording = scan_all(path)
     assert recording.topics == {}
-    assert (
-        sum(sum((loss.messages or {}).values()) for loss in recording.damage.losses)
-        > len(written) / 10
-    )
+    counts = [sum((one.messages or {}).values()) for one in recording.damage.losses]
+    assert sum(counts) > len(written) / 10
     assert "whose description is lost" in recording.corrupt[1]
 
 
-def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
-    path,
-):
+def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(path):
+    record = "metadata record 'sonar_graph'"
     for options, named in (
-        (
-            {"use_chunking": False},
-            "messages lie outside chunks, metadata record 'sonar_graph'",
-        ),
-        (
-            {"enable_crcs": False},
-            "12 chunks carry no CRC, metadata record 'sonar_graph'",
-        ),
-        ({}, "metadata record 'sonar_graph'"),
+        (LOOSE, f"messages lie outside chunks, {record}"),
+        ({"enable_crcs": False}, f"12 chunks carry no CRC, {record}"),
+        ({}, record),
     ):
         write(path, **options)
         assert scan_all(path).notes() == {"log.unprotected": named}
@@ -347,14 +332,13 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
     assert scan_all(path).damage == Damage()
     at_text(written[200][1], 3)(path)
     (loss,) = scan_all(path).damage.losses
-    assert (
-        "the CRC over all data does not fit, and messages lie outside chunks"
-        in loss.reason
-    )
+    message = "the CRC over all data does not fit, and messages lie outside chunks"
+    assert message in loss.reason
+    sealed = {"calibration": "0.05", "name": "x"}
     with writing(path) as writer:
-        writer.add_metadata("sonar_graph", seal({"calibration": "0.05", "name": "x"}))
+        writer.add_metadata("sonar_graph", seal(sealed))
     recording = scan_all(path)
-    assert recording.metadata == {"sonar_graph": {"calibration": "0.05", "name": "x"}}
+    assert recording.metadata == {"sonar_graph": sealed}
     assert recording.damage == Damage()
     at_text(b"0.05", 3)(path)
     recording = scan_all(path)
@@ -362,25 +346,18 @@ def test_what_no_crc_covers_is_named_and_what_one_covers_is_whole_or_lost(
     assert "a metadata record is lost: its CRC does not fit" in recording.corrupt[0]
 
 
-def test_a_truncated_file_is_read_up_to_the_cut(
-    path,
-):
+def test_a_truncated_file_is_read_up_to_the_cut(path):
     written = write(path)
-    chunks = chunk_indexes(path)
-    content = path.read_bytes()
-    path.write_bytes(content[: chunk_end(chunks[-1])])
-    assert (scan_all(path).ending or "").startswith(
-        "the file is cut off: it ends after a whole record"
-    )
-    flip(path, chunks[-1].chunk_start_offset + 1)  # the outer length of the last chunk
+    first, *_, last = chunk_indexes(path)
+    cut(path, chunk_end(last))
+    end = "the file is cut off: it ends after a whole record"
+    assert (scan_all(path).ending or "").startswith(end)
+    flip(path, last.chunk_start_offset + 1)  # the outer length of the last chunk
     assert read(path) == written
-    path.write_bytes(content[: chunks[0].chunk_start_offset + 3])
-    assert re.search(
-        r"^the file is cut off: .*; no message is there$", scan_all(path).ending or ""
-    )
-    with pytest.raises(
-        MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "
-    ):
+    cut(path, first.chunk_start_offset + 3)
+    assert (scan_all(path).ending or "").endswith("; no message is there")
+    message = r"log\.mcap: has no messages: the file is cut off: "
+    with pytest.raises(MissingTopicError, match=message):
         read_log(path)
 
 
@@ -388,21 +365,14 @@ def test_a_truncated_file_is_read_up_to_the_cut(
 def test_half_a_chunk_gives_its_whole_messages(path, compression):
     written = write(path, 12_000, chunk_size=1 << 18, compression=compression)
     second = chunk_indexes(path)[1]
-    before = int(
-        np.searchsorted([time for time, _ in written], second.message_start_time)
-    )
-    path.write_bytes(
-        path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2]
-    )
+    cut(path, second.chunk_start_offset + second.chunk_length // 2)
     found = read(path)
     assert found == written[: len(found)]
-    assert len(found) > before + 0.2 * before
+    # messages are a nanosecond apart, from 1000 on
+    assert len(found) > 1.2 * (second.message_start_time - 1000)
     ending = scan_all(path).ending or ""
     assert "which no CRC covers" in ending
     assert ending.endswith(f"what is there spans {(found[-1][0] - 1000) * 1e-9:.3f} s")
-
-
-# ---- files that are cut off
 
 
 # ---- files that are no logs
@@ -451,11 +421,8 @@ def test_other_files_are_named_for_what_they_are(tmp_path):
         assert len(str(refusal.value).replace(str(path), "log.bag")) <= 300
     viewer = tmp_path / "dive.oculus"
     viewer.write_bytes(b"\x44\x33\x22\x11")
-    with pytest.raises(
-        LogError, match="a file of the Oculus viewer, which is not read"
-    ):
-        scan_all(viewer)
     for path, kind in (
+        (viewer, "a file of the Oculus viewer, which is not read"),
         (tmp_path, "is a folder"),
         (tmp_path / "none.mcap", "No such file"),
     ):
@@ -465,50 +432,31 @@ def test_other_files_are_named_for_what_they_are(tmp_path):
 
 def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path):
     write_apart(path)
-    recording = scan_all(path, TimeWindow(Instant.parse("10"), Instant.parse("20")))
-    times_s = sorted(
-        t
-        for name in ("/a", "/b")
-        for t in (recording.topics[name].log_times_ns // 10**9).tolist()
-    )
-    assert times_s == list(range(11, 21))
+    recording = scan_all(path, TimeWindow.parse("10", "20"))
+    times_ns = [recording.topics[name].log_times_ns for name in ("/a", "/b")]
+    assert sorted(np.concatenate(times_ns) // 10**9) == list(range(11, 21))
     assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
     assert recording.skipped_chunks == 89
     assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
-    absolute = TimeWindow(Instant.parse("1970-01-01T00:01:31Z"))
+    absolute = TimeWindow.parse("1970-01-01T00:01:31Z", None)
     assert sum(len(t) for t in scan_all(path, absolute).topics.values()) == 11
-    with pytest.raises(
-        LogError, match=r"nothing was recorded from 1000\.000 s to the end"
+    message = r"nothing was recorded from 1000\.000 s to the end"
+    with pytest.raises(LogError, match=message):
+        scan_all(path, TimeWindow.parse("1000", None))
+
+
+def test_a_window_takes_seconds_and_dates_and_refuses_all_else():
+    beginning_ns = 1_700_000_000_000_000_001
+    for text, expected_ns in (
+        ("1970-01-02T00:00:01", 86_401_000_000_000),
+        ("1970-01-02T01:00:01.5+01:00", 86_401_500_000_000),
+        ("1.5", beginning_ns + 1_500_000_000),
     ):
-        scan_all(path, TimeWindow(Instant.parse("1000")))
-
-
-# ---- parts of a file
-
-
-BEGINNING_NS = 1_700_000_000_000_000_001
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "-1",
-        "nan",
-        "inf",
-        "x",
-    ],
-)
-def test_a_window_takes_seconds_and_dates_and_refuses_all_else(
-    text,
-):
-    assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
-    zoned = Instant.parse("1970-01-02T01:00:01.5+01:00")
-    assert zoned.resolve(BEGINNING_NS) == 86_401_500_000_000
-    assert Instant.parse("1.5").resolve(BEGINNING_NS) == BEGINNING_NS + 1_500_000_000
+        assert Instant.parse(text).resolve(beginning_ns) == expected_ns
     assert Instant.parse("1700000000").resolve(0) == 1_700_000_000 * 10**9
-    with pytest.raises(
-        LogError, match=r"no time in a log: give seconds from its beginning"
-    ):
-        Instant.parse(text)
+    for text in ("-1", "nan", "inf", "x"):
+        message = r"no time in a log: give seconds from its beginning"
+        with pytest.raises(LogError, match=message):
+            Instant.parse(text)
     with pytest.raises(LogError, match="ends before it starts"):
-        TimeWindow(Instant.parse("2"), Instant.parse("2")).resolve(BEGINNING_NS)
+        TimeWindow.parse("2", "2").resolve(beginning_ns)

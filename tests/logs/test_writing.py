@@ -5,14 +5,13 @@ import signal
 import subprocess
 import sys
 import zlib
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
@@ -21,13 +20,13 @@ from rosbags.highlevel import AnyReader
 from sonar_graph.errors import LogError
 from sonar_graph.images import SonarFrames
 from sonar_graph.logs import read_log, sonar_image_messages, write_log
-from sonar_graph.logs.mcap import LogFile, recording, write_recording
+from sonar_graph.logs.mcap import LogFile, write_recording
 from sonar_graph.logs.mcap.log_file import open_seal
 from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.measurements import Imu
 from sonar_graph.states import Trajectory
 
-from .conftest import chunk_indexes, decode, flip, scan_all
+from .conftest import decode, scan_all
 
 T0_NS = 1_700_000_000_000_000_000
 BLOCKS = (
@@ -62,31 +61,28 @@ def test_reading_what_was_written_is_the_identity(
         expected = getattr(sequence, name)
         actual = getattr(found, name)
         assert (expected is None) == (actual is None), name
-        for field in fields(expected) if expected is not None else ():
+        for field, column in vars(expected).items() if expected is not None else ():
             np.testing.assert_array_equal(
-                getattr(actual, field.name),
-                getattr(expected, field.name),
-                f"{name}.{field.name}",
+                getattr(actual, field), column, f"{name}.{field}"
             )
     assert (found.name, found.calibration) == (sequence.name, sequence.calibration)
     assert found.notes.items() >= sequence.notes.items()
 
 
 def test_stamps_and_samples_beyond_ros_are_refused(make_sequence, tmp_path):
+    path = tmp_path / "a.mcap"
     for stamp_ns in (2**31 * 10**9, -(2**31) * 10**9 - 1):
-        sequence = replace(
-            make_sequence(),
-            imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))),
-        )
+        imu = Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3)))
         with pytest.raises(LogError, match="32-bit seconds"):
-            write_log(tmp_path / "a.mcap", sequence)
-        assert list(tmp_path.iterdir()) == []
+            write_log(path, replace(make_sequence(), imu=imu))
+    kinds = frames("u1"), frames("c16")
+    images = (sonar_image_messages("/sonar/image", kind) for kind in kinds)
     with pytest.raises(LogError, match="/sonar/image: samples of type complex"):
-        write_frames(tmp_path / "a.mcap", frames(), frames("c16"))
+        write_log(path, make_sequence(), images)
     assert list(tmp_path.iterdir()) == []
-    (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(LogError, match=r"file/a\.mcap cannot be written"):
-        write_log(tmp_path / "file" / "a.mcap", make_sequence())
+    path.write_text("not a folder")
+    with pytest.raises(LogError, match=r"a\.mcap/b\.mcap cannot be written"):
+        write_log(path / "b.mcap", make_sequence())
 
 
 # --- sonar images ----------------------------------------------------------------------------------------------------
@@ -100,49 +96,27 @@ def frames(kind: str = "u1", count: int = 3) -> SonarFrames:
     return SonarFrames(stamps_ns, intensity.astype(kind), ranges_m, azimuths_rad)
 
 
-def write_frames(path: Path, *blocks: SonarFrames) -> Path:
-    sonar = {"frequency_hz": 1.8e6, "sound_speed_m_s": 1480}
-    with recording(path, {}) as out:
-        for block in blocks:
-            out.write([sonar_image_messages("/sonar/image", block, **sonar)])
-    return path
-
-
-def test_another_library_sees_what_the_message_defines(tmp_path):
-    written = frames()
-    (messages,) = decode(write_frames(tmp_path / "log.mcap", written)).values()
-    assert [m.header.stamp.nanosec for m in messages] == [123, 100_000_123, 200_000_123]
-    first = messages[0]
-    sonar = (first.ping_info.frequency, first.ping_info.sound_speed)
-    assert sonar == (np.float32(1.8e6), 1480)
-    image = first.image
-    assert (image.dtype, image.beam_count, image.is_bigendian) == (0, 4, False)
-    # all beams of the first range first
-    assert bytes(image.data) == written.intensity[0].T.tobytes()
-    left = first.beam_directions[0]
-    right = first.beam_directions[-1]
-    assert (left.x, right.x) == (0, 0)
-    assert left.y < 0 < right.y  # y is to the right
-    np.testing.assert_allclose([left.z, right.z], np.cos(np.radians([14, 15])))
-
-
 def test_messages_made_one_by_one_lie_in_the_order_of_time(make_sequence, tmp_path):
     sequence = make_sequence()
-    write_log(tmp_path / "a.mcap", sequence)
     stamps_ns = sequence.imu.stamps_ns[[4, 12]]
-    images = (
-        sonar_image_messages("/sonar/image", replace(frames(count=1), stamps_ns=at_ns))
-        for at_ns in np.split(stamps_ns, 2)
+    single = (
+        replace(frames(count=1), stamps_ns=at_ns) for at_ns in np.split(stamps_ns, 2)
     )
-    write_log(tmp_path / "b.mcap", sequence, images)
+    sonar = {"frequency_hz": 1.8e6, "sound_speed_m_s": 1480}
+    images = [sonar_image_messages("/sonar/image", one, **sonar) for one in single]
     times = []
-    for name in ("a.mcap", "b.mcap"):
-        with (tmp_path / name).open("rb") as stream:
+    for more in ([], images):
+        write_log(tmp_path / "a.mcap", sequence, iter(more))
+        with (tmp_path / "a.mcap").open("rb") as stream:
             records = StreamReader(stream).records
             times.append([r.log_time for r in records if isinstance(r, Message)])
-    assert len(times[0]) > 80
-    assert times[0] == sorted(times[0])
-    assert times[1] == sorted([*times[0], *stamps_ns.tolist()])
+    without, complete = times
+    assert len(without) > 80
+    assert without == sorted(without)
+    assert complete == sorted([*without, *stamps_ns.tolist()])
+    for message in decode(tmp_path / "a.mcap")["/sonar/image"]:
+        said = message.ping_info.frequency, message.ping_info.sound_speed
+        assert said == (np.float32(1.8e6), 1480)
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -163,9 +137,7 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_recording_has_the_records_of_rosbag2(
-    long_log,
-):
+def test_a_recording_has_the_records_of_rosbag2(long_log):
     with long_log.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
@@ -175,32 +147,23 @@ def test_a_recording_has_the_records_of_rosbag2(
         indexes = summary.chunk_indexes
         assert len(indexes) > 3
         assert all(one.message_index_length and one.compression for one in indexes)
-        assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
-        assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
-        about = {m.name: m.metadata for m in reader.iter_metadata()}["about"]
-        assert open_seal(about) == ({"key": "value ψ"}, True)
+        records = {m.name: m.metadata for m in reader.iter_metadata()}
+    assert open_seal(records["about"]) == ({"key": "value ψ"}, True)
+    # versions that would expect words read numbers when the record has no metadata of theirs
+    assert records["rosbag2"] == {"serialized_metadata": ""}
+    offers = {c.topic: c.metadata for c in summary.channels.values()}
+    assert "durability: 1," in offers["/start"]["offered_qos_profiles"]
 
 
-def test_crcs_cover_each_chunk_and_all_data(long_log, tmp_path):
+def test_crcs_cover_each_chunk_and_all_data(long_log):
+    assert scan_all(long_log).notes() == {}  # which names chunks without a CRC
     with LogFile(long_log) as file:
         assert (file.summary is not None, file.fault) == (True, None)
         stated = int.from_bytes(file.read(file.data_end_at + 9, 4), "little")
         assert stated == zlib.crc32(file.read(0, file.data_end_at)) != 0
-    chunk = chunk_indexes(long_log)[1]
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(long_log.read_bytes())
-    flip(damaged, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
-    with (
-        damaged.open("rb") as stream,
-        pytest.raises((McapError, ValueError, RuntimeError)),
-    ):
-        list(make_reader(stream, validate_crcs=True).iter_messages())
 
 
-def test_latched_topics_offer_transient_local_qos(
-    long_log,
-):
-    """Versions that would expect words read numbers when the record ``rosbag2`` has no metadata of theirs."""
+def test_latched_topics_offer_transient_local_qos(long_log):
     with AnyReader([long_log]) as reader:
         offered = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
         assert sum(1 for _ in reader.messages()) == 20_001
@@ -208,13 +171,6 @@ def test_latched_topics_offer_transient_local_qos(
     names = (start.durability.name, start.reliability.name, start.history.name)
     assert names == ("TRANSIENT_LOCAL", "RELIABLE", "KEEP_LAST")
     assert offered["/pose"] == []
-    with long_log.open("rb") as stream:
-        reader = make_reader(stream)
-        channels = reader.get_summary().channels.values()
-        metadata = {c.topic: c.metadata for c in channels}
-        assert "durability: 1," in metadata["/start"]["offered_qos_profiles"]
-        records = {m.name: m.metadata for m in reader.iter_metadata()}
-        assert records["rosbag2"] == {"serialized_metadata": ""}
 
 
 WRITER = """

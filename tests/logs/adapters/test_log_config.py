@@ -18,6 +18,8 @@ MISTAKES: dict[str, tuple[str | None, str]] = {
     "no velocity": ('[dvl]\ntype = "my_msgs/msg/Dvl"', r"\[dvl\] .*give velocity = \[x, y, z\] fields"),
     "pressure and height": ('[depth]\ntype = "sensor_msgs/msg/FluidPressure"\nheight = "data"',
         r"\[depth\] .*give either"),
+    "a heading of nothing": ('[heading]\ntype = "a/msg/B"', r"\[heading\] .*give either orientation"),
+    "a position of nothing": ('[positions]\ntype = "a/msg/B"', r"\[positions\] .*give either position"),
     "type that is no text": ("[dvl]\ntype = 3", r"\[dvl\] type: expected a text such as 'marine"),
     "scale of zero": ("[dvl]\nscale = 0", r"\[dvl\] scale: expected a factor, .*not 0"),
     "no TOML": ("[dvl", "not TOML"),

@@ -70,14 +70,12 @@ class Ddf(Recorded):
     start_code: int = 3
     length_code: int = 0
     flags: int = 0
-    promised: int | None = None
     frame_version: bytes | None = None
 
     def file_header(self) -> bytes:
         count, beams, samples = self.frames.shape
         header = bytearray(512 if self.version == 3 else 1024)
-        promised = count if self.promised is None else self.promised
-        put(header, 0, "3sB4i", b"DDF", self.version, promised, 8, self.high, beams)
+        put(header, 0, "3sB4i", b"DDF", self.version, count, 8, self.high, beams)
         put(header, 20, "fi", 400_000.0, samples)
         window = self.start_code, self.length_code
         put(header, 28, "5i32s", 20, *window, self.reverse, self.serial, b"2014-05-06")
@@ -104,10 +102,7 @@ class Aris(Recorded):
     mode: int = 9
     telephoto: int = 0
     system: int = 1
-    high: int = 1
     sound_speed: float = 1482.5
-    period_us: int = 5
-    delay_us: int = 1700
     in_order: int = 1
     sound_speeds: Sequence[float] = ()
 
@@ -121,73 +116,48 @@ class Aris(Recorded):
         put(header, 128, "f", 1.5 + i)
         put(header, 160, "f", 90.0 - i)
         speed = self.sound_speeds[i] if self.sound_speeds else self.sound_speed
-        ping = self.mode, self.high, 12, 30_000, self.period_us, 1
+        # high frequency, 12, 30 kHz, a sample each 5 us
+        ping = self.mode, 1, 12, 30_000, 5, 1
         put(header, 436, "6I2fI", *ping, 8.3, speed, self.frames.shape[2])
-        put(header, 476, "3I", self.delay_us, self.telephoto, self.system)
+        put(header, 476, "3I", 1700, self.telephoto, self.system)
         put(header, 516, "I", self.in_order)
         return bytes(header) + self.frames[i].T.tobytes()
 
 
 @dataclass
 class Oculus(Recorded):
-    """Oculus pings of either version, with samples of 8, 16 or 32 bits and with or without gains."""
+    """Oculus pings of either version, with samples of 8, 16 or 32 bits and without gains."""
 
     ending = "raw"
     version: int = 0
-    gains: NDArray[np.uint32] | None = None
-    first_clock: int = 2**32 - 100_000_000
-    bin_m: float = 0.003
-    first_number: int = 500
     gamma_code: int = 127
 
     def frame(self, i: int) -> bytes:
         image = np.ascontiguousarray(self.frames[i].T)
         ranges, beams = image.shape
-        rows = [row.astype(f"<u{image.itemsize}").tobytes() for row in image]
-        if self.gains is not None:
-            rows = [
-                struct.pack("<I", gain) + row
-                for gain, row in zip(self.gains.tolist(), rows, strict=True)
-            ]
-        pixels = b"".join(rows)
-        bearings = struct.pack(
-            f"<{beams}h", *np.linspace(-6500, 6000, beams).astype(int).tolist()
-        )
-        extra = struct.pack("<9I", *range(9)) if self.version == 2 else b""
-        flags = 0b11001 | (0b100 if self.gains is not None else 0)
-        fire = (
-            struct.pack("<5B4d", 2, 0, 255, self.gamma_code, flags, 2.0, 50.0, 0.0, 0.0)
-            + extra
-        )
-        clock_ns = self.first_clock + i * STEP_NS
-        number = self.first_number + i
-        if self.version == 2:
-            result = struct.pack(
-                "<2I8d",
-                number,
-                0,
-                2.1e6,
-                12.5,
-                1.9,
-                45.0 + i,
-                3.0,
-                -2.0,
-                1481.0,
-                clock_ns * 1e-9,
-            )
+        pixels = image.astype(f"<u{image.itemsize}").tobytes()
+        bearings = np.linspace(-6500, 6000, beams).astype("<i2").tobytes()
+        flags = 2, 0, 255, self.gamma_code, 0b11001
+        fire = struct.pack("<5B4d", *flags, 2.0, 50.0, 0.0, 0.0)
+        # a clock of 32 bits that wraps around
+        clock_ns = 2**32 - 100_000_000 + i * STEP_NS
+        head = 500 + i, 0, 2.1e6, 12.5, 1.9
+        is_wide = self.version == 2
+        if is_wide:
+            fire += struct.pack("<9I", *range(9))
+            attitude = 45.0 + i, 3.0, -2.0
+            result = struct.pack("<2I8d", *head, *attitude, 1481.0, clock_ns * 1e-9)
         else:
-            result = struct.pack(
-                "<2I4dI", number, 0, 2.1e6, 12.5, 1.9, 1481.0, clock_ns % 2**32
-            )
-        result += struct.pack("<BdHH", image.itemsize - 1, self.bin_m, ranges, beams)
-        result += struct.pack("<4I", 0, 0, 0, 0) if self.version == 2 else b""
+            result = struct.pack("<2I4dI", *head, 1481.0, clock_ns % 2**32)
+        result += struct.pack("<BdHH", image.itemsize - 1, 0.003, ranges, beams)
+        result += bytes(16 * is_wide)
         offset = 2048
         total = offset + len(pixels)
         result += struct.pack("<3I", offset, len(pixels), total)
-        header = struct.pack(
-            "<HHHHHIH", 0x4F53, 1, 2, 0x23, self.version, total - 16, 0
-        )
-        return (header + fire + result + bearings).ljust(offset, b"\0") + pixels
+        kind = 0x4F53, 1, 2, 0x23, self.version
+        header = struct.pack("<HHHHHIH", *kind, total - 16, 0)
+        content = header + fire + result + bearings
+        return content.ljust(offset, b"\0") + pixels
 
 
 def no_ping(payload: bytes = b"\0" * 12) -> bytes:

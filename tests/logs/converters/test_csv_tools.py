@@ -1,6 +1,5 @@
 """Tables as tools write them are read right by the template's guess, or the template has a question."""
 
-import re
 import tomllib
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,6 +13,7 @@ from sonar_graph.logs.convert import csv_template, read_csv
 from sonar_graph.logs.convert.csv_evidence import time_units
 
 ROWS = 600
+OF_IMU = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
 EPOCH_S = 1_777_638_600.0
 """2026-05-01T12:30:00Z."""
 
@@ -23,36 +23,28 @@ def dive(imu_hz: float = 50.0, every: int = 10) -> SimpleNamespace:
     rng = np.random.default_rng(7)
     s = np.arange(ROWS) / imu_hz
     slow = s[::every]
-    turns = np.sin(slow), np.cos(slow), np.sin(2 * slow)
+    turns = np.column_stack([np.sin(slow), np.cos(slow), np.sin(2 * slow)])
     return SimpleNamespace(
         s=s,
         slow=slow,
         rate=rng.normal(0, 0.1, (ROWS, 3)),
         force=rng.normal([0, 0, 9.81], 0.05, (ROWS, 3)),
-        velocity=np.column_stack(turns) * [0.3, 0.1, 0.05] + [0.8, 0, 0],
+        velocity=turns * [0.3, 0.1, 0.05] + [0.8, 0, 0],
         depth=4 + np.sin(0.3 * slow),
         bearing=(300 + 40 * np.sin(0.5 * slow)) % 360,
     )
 
 
-@pytest.fixture
-def d() -> SimpleNamespace:
-    return dive()
-
-
 def write(
-    path: Path, header: str, *columns, sep: str = ",", number=repr, **how
+    path: Path, header: str, *columns, sep=",", number=repr, encoding="utf-8"
 ) -> None:
     """Write a header and rows of columns, each text or numbers."""
-    rows = [
-        sep.join(
-            cell if isinstance(cell, str) else number(float(cell))
-            for cell in np.atleast_1d(np.array(row, dtype=object))
-        )
-        for row in zip(*columns, strict=True)
+    cells = [
+        [cell if isinstance(cell, str) else number(float(cell)) for cell in column]
+        for column in columns
     ]
-    text = "\n".join([header, *rows]) + "\n"
-    path.write_bytes(text.encode(how.get("encoding", "utf-8")))
+    rows = map(sep.join, zip(*cells, strict=True))
+    path.write_text("\n".join([header, *rows]) + "\n", encoding)
 
 
 def dates(s: np.ndarray, form: str, tail: int = 3) -> list[str]:
@@ -69,32 +61,24 @@ def template(folder: Path) -> tuple[str, dict]:
     return text, tomllib.loads(text)
 
 
-def guessed(folder: Path, tmp_path: Path, text: str | None = None):
-    config = tmp_path / "guess.toml"
-    config.write_text(csv_template([folder]) if text is None else text)
-    return read_csv(folder, config)
+def guessed(folder: Path):
+    return read_csv(folder, template(folder)[1])
 
 
-def uncommented(text: str, role: str) -> str:
-    """The template after its user has taken the first commented table of a role into use."""
-    blocks = text.split("\n\n")
-    at = next(k for k, block in enumerate(blocks) if block.startswith(f"# [{role}]"))
-    blocks[at] = re.sub(r"(?m)^# ", "", blocks[at])
-    return "\n\n".join(blocks)
+def assert_is(sequence, dive: SimpleNamespace) -> None:
+    seconds = (sequence.imu.stamps_ns - sequence.imu.stamps_ns[0]) * 1e-9
+    np.testing.assert_allclose(seconds, dive.s, rtol=0, atol=1e-3)
+    for found, expected in (
+        (sequence.imu.angular_velocity, dive.rate),
+        (sequence.dvl.velocity, dive.velocity),
+        (-sequence.depth.z_m, dive.depth),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def assert_is(sequence, dive: SimpleNamespace, atol: float = 1e-9) -> None:
-    np.testing.assert_allclose(
-        (sequence.imu.stamps_ns - sequence.imu.stamps_ns[0]) * 1e-9,
-        dive.s,
-        rtol=0,
-        atol=1e-3,
-    )
-    np.testing.assert_allclose(
-        sequence.imu.angular_velocity, dive.rate, rtol=0, atol=atol
-    )
-    np.testing.assert_allclose(sequence.dvl.velocity, dive.velocity, rtol=0, atol=atol)
-    np.testing.assert_allclose(-sequence.depth.z_m, dive.depth, rtol=0, atol=atol)
+@pytest.fixture
+def d() -> SimpleNamespace:
+    return dive()
 
 
 @pytest.fixture
@@ -114,8 +98,7 @@ def plain(
     """The tables of a dive that a test does not write in its own way."""
     t, slow = (np.round((start_s + s) * scale, 9) for s in (d.s, d.slow))
     if "imu" in names:
-        header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
-        write(folder / "imu.csv", header, t, *d.rate.T, *d.force.T)
+        write(folder / "imu.csv", OF_IMU, t, *d.rate.T, *d.force.T)
     if "dvl" in names:
         write(folder / "dvl.csv", "time,vel_x,vel_y,vel_z", slow, *d.velocity.T)
     if "depth" in names:
@@ -153,7 +136,7 @@ TOOLS = {
 
 
 @pytest.mark.parametrize("tool", TOOLS)
-def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool, d):
+def test_tables_of_a_tool_are_read_without_an_edit(folder, tool, d):
     of_imu, of_dvl, form, (force, velocity, depth), how = TOOLS[tool]
     stamps, slow = (1e3 * s if form is None else dates(s, form) for s in (d.s, d.slow))
     columns = (*np.degrees(d.rate).T, *(force * d.force).T)
@@ -163,13 +146,14 @@ def test_tables_of_a_tool_are_read_without_an_edit(folder, tmp_path, tool, d):
     imu = template(folder)[1]["imu"]
     if "encoding" in how:
         assert (imu["decimal"], imu["encoding"]) == (",", "cp1252")
-    assert_is(guessed(folder, tmp_path), d)
+    assert_is(guessed(folder), d)
 
 
-def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
+def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder):
     d = dive(imu_hz=10.0, every=1)
     stamps = dates(d.s, "%Y-%m-%d %H:%M:%S.@")
-    header = "Timestamp,heading,rollRate,pitchRate,yawRate,groundSpeed,battery0.id"
+    rates = "rollRate", "pitchRate", "yawRate"
+    header = f"Timestamp,heading,{','.join(rates)},groundSpeed,battery0.id"
     flat = np.zeros(ROWS)
     columns = d.bearing, *np.degrees(d.rate).T, flat, flat
     write(folder / "vehicle.csv", header, stamps, *columns)
@@ -180,10 +164,11 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
     assert config["heading"]["scale"] == "deg"
     assert "# [imu]  # no accelerometer: is this the IMU?" in text
     with pytest.raises(LogError, match=r"has no table \[imu\]"):
-        guessed(folder, tmp_path)
-    unit = 'angular_velocity_scale = "deg/s"'
-    taken = uncommented(text, "imu").replace(f"# {unit}", unit)
-    sequence = guessed(folder, tmp_path, taken.replace(unit, f"{unit}\n"))
+        guessed(folder)
+    question, rest = text.split("# [imu]", 1)
+    table, rest = rest.split("\n\n", 1)
+    table = f"[imu]{table}".replace("\n# ", "\n")
+    sequence = read_csv(folder, tomllib.loads(f"{question}{table}\n\n{rest}"))
     np.testing.assert_allclose(sequence.imu.angular_velocity, d.rate, atol=1e-9)
     assert np.isnan(sequence.imu.specific_force).all()
     expected = np.unwrap(np.radians(90 - d.bearing))
@@ -192,42 +177,33 @@ def test_qgroundcontrol_has_no_imu_and_the_template_asks(folder, tmp_path):
 
 @pytest.mark.parametrize(("imu_hz", "every"), [(1000.0, 200), (100.0, 20), (200.0, 40)])
 @pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e9])
-def test_units_of_times_follow_from_the_sensors_rates(
-    folder, tmp_path, imu_hz, every, scale
-):
+def test_units_of_times_follow_from_the_sensors_rates(folder, imu_hz, every, scale):
     # enough rows of the Doppler log for a rate
     d = dive(imu_hz, every // 4)
     plain(folder, d, "imu", "dvl", "depth", scale=scale)
-    sequence = guessed(folder, tmp_path)
+    sequence = guessed(folder)
     assert sequence.duration_s == pytest.approx(d.s[-1], rel=0.1)
-    assert sequence.depth.stamps_ns[-1] == pytest.approx(
-        sequence.dvl.stamps_ns[-1], abs=1
-    )
+    last_ns = sequence.dvl.stamps_ns[-1]
+    assert sequence.depth.stamps_ns[-1] == pytest.approx(last_ns, abs=1)
 
 
-def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(
-    folder, tmp_path, d
-):
+def test_a_unit_in_the_header_that_contradicts_the_steps_is_a_question(folder, d):
     plain(folder, d, "imu", "dvl", "depth", scale=1e3)
     for path in folder.iterdir():
         path.write_text(path.read_text().replace("time", "time [s]"))
     assert "# the header states s, the steps do not fit:" in template(folder)[0]
     with pytest.raises(LogError, match='stamp_unit_s = "ms"'):
-        guessed(folder, tmp_path)
+        guessed(folder)
 
 
 @pytest.mark.parametrize(
-    ("name", "header"),
-    [
-        ("depth", "time,depth"),
-        ("dvl", "time,vel_x,vel_y,vel_z"),
-        ("heading", "time,yaw"),
-    ],
+    ("name", "values"),
+    [("depth", "depth"), ("dvl", "vel_x,vel_y,vel_z"), ("heading", "yaw")],
 )
-def test_a_column_that_never_changes_is_no_motion(folder, name, header, d):
+def test_a_column_that_never_changes_is_no_motion(folder, name, values, d):
     plain(folder, d, "imu", "dvl", "depth")
-    count = header.count(",")
-    write(folder / f"{name}.csv", header, d.s, *np.full((count, ROWS), 0.5))
+    columns = [np.full(ROWS, 0.5) for _ in values.split(",")]
+    write(folder / f"{name}.csv", f"time,{values}", d.s, *columns)
     text, config = template(folder)
     assert name not in config
     assert f"# [{name}]  # never changes" in text
@@ -236,67 +212,60 @@ def test_a_column_that_never_changes_is_no_motion(folder, name, header, d):
 # --- tables of other tools, and what they must not be taken for -------------------------------------------------------
 
 
-def test_pressures_below_that_of_the_air_count_from_the_surface(folder, tmp_path, d):
+def test_pressures_below_that_of_the_air_count_from_the_surface(folder, d):
     plain(folder, d, "imu", "dvl")
     decibar = d.depth * 9.80665 / 10
     write(folder / "ctd.csv", "time;Pressure (dbar)", d.slow, decibar, sep=";")
-    depth_m = -guessed(folder, tmp_path).depth.z_m
-    np.testing.assert_allclose(depth_m, d.depth, rtol=5e-3)
+    np.testing.assert_allclose(-guessed(folder).depth.z_m, d.depth, rtol=5e-3)
 
 
-def test_plotjuggler_and_rostopic_names_with_paths(folder, tmp_path, d):
-    paths = [f"/imu/{kind}/{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz"]  # fmt: skip
-    header = ",".join(["__time", *paths])
+def test_plotjuggler_and_rostopic_names_with_paths(folder, d):
+    rates, forces = (
+        [f"/imu/{kind}/{axis}" for axis in "xyz"]
+        for kind in ("angular_velocity", "linear_acceleration")
+    )
+    header = ",".join(["__time", *rates, *forces])
     write(folder / "imu.csv", header, EPOCH_S + d.s, *d.rate.T, *d.force.T)
     ns = [str(round(EPOCH_S) * 10**9 + round(t * 1e9)) for t in d.slow]
     header = "%time,field.header.frame_id,field.velocity.x,field.velocity.y,field.velocity.z,field.depth"
     columns = (ns, ["dvl"] * len(ns), *d.velocity.T, d.depth)
     write(folder / "dvl.csv", header, *columns)
-    assert_is(guessed(folder, tmp_path), d)
+    assert_is(guessed(folder), d)
 
 
-@pytest.mark.parametrize(
-    "form",
-    [
-        "%m/%d/%Y %H:%M:%S.@",
-        "%H:%M:%S.@",
-    ],
-)
-def test_times_whose_day_or_second_is_not_known_are_refused(folder, tmp_path, form, d):
+@pytest.mark.parametrize("form", ["%m/%d/%Y %H:%M:%S.@", "%H:%M:%S.@"])
+def test_times_whose_day_or_second_is_not_known_are_refused(folder, form, d):
     plain(folder, d, "dvl", "depth")
-    header = "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
-    write(folder / "imu.csv", header, dates(d.s, form), *d.rate.T, *d.force.T)
+    write(folder / "imu.csv", OF_IMU, dates(d.s, form), *d.rate.T, *d.force.T)
     with pytest.raises(LogError, match=r"is no time; expected a number .* or a date"):
-        guessed(folder, tmp_path)
+        guessed(folder)
 
 
-def test_numbers_with_thousands_separators_are_refused(folder, tmp_path, d):
+def test_numbers_with_thousands_separators_are_refused(folder, d):
     plain(folder, d, "imu", "dvl")
     cells = [f"{depth:,.1f}" for depth in 1000 * d.depth]
     write(folder / "depth.csv", "time;depth [mm]", d.slow, cells, sep=";")
-    with pytest.raises(
-        LogError, match=r"depth\.csv, line 2: .*'4,000\.0' is no number"
-    ):
-        guessed(folder, tmp_path)
+    message = r"depth\.csv, line 2: .*'4,000\.0' is no number"
+    with pytest.raises(LogError, match=message):
+        guessed(folder)
 
 
 @pytest.mark.parametrize(("name", "held"), [("velocity_valid", 1), ("velo_flag", 0)])
 def test_a_column_of_validity_is_proposed_and_missed_where_it_is_not_used(
-    folder, tmp_path, name, held, d
+    folder, name, held, d
 ):
     """By its name, or by velocities that are zero in the marked rows; the header has no unit."""
     plain(folder, d, "imu", "depth")
     is_lost = np.isin(np.arange(len(d.slow)), range(10, 20))
     velocity = 1000 * d.velocity * np.where(is_lost, held, 1)[:, None]
-    marks = np.where(is_lost, "false", "true").tolist()
+    marks = ["false" if lost else "true" for lost in is_lost]
     header = f"time,vel_x,vel_y,vel_z,{name}"
     write(folder / "dvl.csv", header, d.slow, *velocity.T, marks)
     config = template(folder)[1]
-    assert config["dvl"]["valid_where"] == {name: 1}
     assert config["dvl"]["scale"] == "mm/s"
-    found = guessed(folder, tmp_path).dvl.velocity
+    found = read_csv(folder, config).dvl.velocity
     np.testing.assert_allclose(found, d.velocity[~is_lost], atol=1e-9)
-    del config["dvl"]["valid_where"]
+    assert config["dvl"].pop("valid_where") == {name: 1}
     warning = read_csv(folder, config).notes["csv.warnings"]
     assert f"column {name} is 0 in 10 of 60 rows and not used" in warning
     assert f"`valid_where = {{{name} = 1}}`" in warning
