@@ -10,7 +10,15 @@ import numpy as np
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Dvl, Floats, Heading, Imu, Ints, PositionFixes
+from sonar_graph.measurements import (
+    Depth,
+    Dvl,
+    Floats,
+    Heading,
+    Imu,
+    Ints,
+    PositionFixes,
+)
 from sonar_graph.sequence import Sequence
 
 
@@ -62,6 +70,12 @@ def heading_rows(stamps_ns: Ints, yaw_rad: Floats) -> Heading:
 
 def fix_rows(stamps_ns: Ints, position_m: Floats) -> PositionFixes:
     return PositionFixes(stamps_ns, position_m, unstated(len(stamps_ns), 3, 3))
+
+
+def with_depth(run: Sequence, z_m: Floats, variance_m2: float = np.nan) -> Sequence:
+    """The run with depths at every tenth row of the IMU."""
+    stamps_ns = run.imu.stamps_ns[::10]
+    return replace(run, depth=Depth(stamps_ns, z_m, np.full(len(z_m), variance_m2)))
 
 
 def level_vehicle(velocity: Floats, yaw_rate: Floats, seed: int) -> Sequence:
