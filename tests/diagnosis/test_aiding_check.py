@@ -314,7 +314,7 @@ def test_heights_that_do_not_begin_at_the_stated_start_or_under_water_are_told(
 @pytest.mark.parametrize(
     ("source", "line"), [("fixes", "use = false"), ("stated", "origin_m")]
 )
-def test_depths_and_fixes_of_different_height_are_a_fault(source: str, line: str):
+def test_depths_and_fixes_of_different_height_are_a_fault(source, line):
     run = recalibrated(fixed(RIGHT, sigma_m=0.3), "start", source=source)
     run = spoilt(run, "depth", z_m=run.depth.z_m - 40.0)
     (found,) = aiding_check.fix_height_findings(run, NO_CONFIG)
@@ -354,7 +354,7 @@ def test_a_swell_makes_no_accelerometers_of_another_scale(phase_rad):
 
 
 @pytest.mark.parametrize("period_s", [4.0, 8.0])
-def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s: float):
+def test_the_sampling_error_of_a_doppler_log_is_that_of_the_trapezoid(period_s):
     """By hand: the integral of a sine over rows a second apart is too small by ``(w T)^2 / 12``."""
     t = np.arange(600.0)
     w = 2 * np.pi / period_s
@@ -404,7 +404,7 @@ def test_sensors_without_noise_are_not_stuck_where_the_vehicle_rests():
 
 
 @pytest.mark.parametrize("changes", [2, 8])
-def test_a_climb_that_begins_between_two_velocities_tells_badly_when(changes: int):
+def test_a_climb_that_begins_between_two_velocities_tells_badly_when(changes):
     """Each sudden change may be anywhere in its two seconds; so many of them tell better by the root of their number."""
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 600.0, 2.0)

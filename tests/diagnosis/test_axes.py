@@ -87,7 +87,7 @@ def test_level_axes_of_the_accelerometers_are_found_with_a_doppler_log_on_a_long
     assert found_axes(run) == ((np.linalg.det(S) * S).tolist(), S.tolist())
 
 
-def test_gravity_over_a_gap_in_a_slow_doppler_log_is_no_change_of_velocity() -> None:
+def test_gravity_over_a_gap_in_a_slow_doppler_log_is_no_change_of_velocity():
     """Rows a second apart, and one interval of three seconds."""
     run = level_drive(0)
     slow = run.dvl.rows(slice(None, None, 5))
@@ -119,7 +119,7 @@ def test_a_way_straight_up_and_down_is_none_in_axes_of_the_world(seed):
     assert turns_less_than_body(imu, dvl, Calibration()) is None
 
 
-def test_without_accelerometers_or_motion_nothing_is_known() -> None:
+def test_without_accelerometers_or_motion_nothing_is_known():
     force = np.full_like(WORLD.imu.specific_force, np.nan)
     blind = spoilt(WORLD, "imu", specific_force=force)
     short = replace(WORLD, dvl=WORLD.dvl.rows(slice(20)))
@@ -127,7 +127,7 @@ def test_without_accelerometers_or_motion_nothing_is_known() -> None:
         assert match_axes(run.imu, run.dvl, run.calibration) is None
 
 
-def test_a_negated_gyro_yaw_is_the_first_finding_with_its_line() -> None:
+def test_a_negated_gyro_yaw_is_the_first_finding_with_its_line():
     """The line replaces that of the configuration."""
     rate = WORLD.imu.angular_velocity * [1.0, 1.0, -1.0]
     run = spoilt(WORLD, "imu", angular_velocity=rate)
@@ -163,6 +163,6 @@ def test_velocities_of_the_world_are_named_where_turned_ones_fit_nearly(seed):
     assert "axes of the world" in first.text()
 
 
-def test_rows_of_the_doppler_log_in_a_hole_of_the_imu_contradict_no_axes() -> None:
+def test_rows_of_the_doppler_log_in_a_hole_of_the_imu_contradict_no_axes():
     run = without_imu(WORLD, 30.0, 55.0)
     assert found_axes(run) == (IDENTITY.tolist(), IDENTITY.tolist())

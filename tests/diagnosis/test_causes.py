@@ -76,7 +76,7 @@ FAULTS: dict[str, tuple[Sequence, str, float]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_cause_is_named_with_its_size_and_nothing_else_is_blamed(fault: str):
+def test_a_cause_is_named_with_its_size_and_nothing_else_is_blamed(fault):
     run, quantity, size = FAULTS[fault]
     (found,) = grave(run)
     assert found.quantity == quantity
@@ -120,19 +120,20 @@ NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @pytest.mark.parametrize(
-    ("turned", "late_s", "line"),
+    ("turned", "late_s", "line", "cause"),
     [
-        (NED, 0.0, '`world = "ned"` under [truth]'),
-        (1000.0 * np.eye(3), 0.0, "`scale = 0.001` under [truth]"),
-        (np.eye(3), 3.0, "`stamp_offset_s = -3"),
-        (np.eye(3), 0.0, ""),
+        (NED, 0.0, '`world = "ned"` under [truth]', "mirror image"),
+        (1000.0 * np.eye(3), 0.0, "`scale = 0.001` under [truth]", ""),
+        (np.eye(3), 3.0, "`stamp_offset_s = -3", ""),
+        (np.eye(3), 0.0, "", ""),
     ],
 )
-def test_a_reference_of_other_axes_unit_or_clock_is_named(turned, late_s, line):
+def test_a_reference_of_other_axes_unit_or_clock_is_named(turned, late_s, line, cause):
     run = truth_of(observed(), turned, late_s)
     found = [one for one in acting(run) if one.quantity.startswith("reference")]
     assert len(found) == (line != "")
-    assert all(line in one.line for one in found)
+    assert all(line in one.line and cause in one.cause for one in found)
+    assert all(one.grave for one in found if cause)
 
 
 @pytest.mark.parametrize(("sigma_m_s", "is_named"), [(10.0, True), (0.5, False)])
@@ -334,7 +335,7 @@ WRONG_SENSES = {
 
 
 @pytest.mark.parametrize("wrong", WRONG_SENSES)
-def test_of_two_that_run_against_each_other_the_right_one_is_not_asked(wrong: str):
+def test_of_two_that_run_against_each_other_the_right_one_is_not_asked(wrong):
     run, lines = WRONG_SENSES[wrong]
     said = " ".join(found.line for found in grave(run))
     asked = set(re.findall(r"under \[(\w+)\]", said))

@@ -341,7 +341,7 @@ def test_velocities_are_known_no_better_than_the_scale_of_the_forces():
     assert np.diff(np.square(sigmas)) == pytest.approx(1e-3**2, rel=0.3)
 
 
-def test_of_forces_without_gravity_nothing_else_is_blamed() -> None:
+def test_of_forces_without_gravity_nothing_else_is_blamed():
     """Neither a bias of the gyros nor depth, heading or fixes."""
     up = RIGHT.truth.at(RIGHT.imu.stamps_ns).rotations().as_matrix()[:, 2, :]
     force = RIGHT.imu.specific_force - 9.80665 * up
@@ -402,7 +402,7 @@ def test_a_bias_that_the_calibration_has_outranks_one_that_it_has_not(
     assert z.value == pytest.approx(expected, abs=1e-4)
 
 
-def test_imu_stamps_of_a_wrong_clock_have_one_line() -> None:
+def test_imu_stamps_of_a_wrong_clock_have_one_line():
     """All other sensors look late, each by another time."""
     stamps_ns = RIGHT.imu.stamps_ns
     ahead_ns = (0.03 * (stamps_ns - stamps_ns[0])).astype(np.int64)

@@ -62,7 +62,7 @@ def test_angle_increments_are_found_with_the_factor_to_rates():
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
+def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed):
     """Beside a gap the velocity is known on one side only."""
     wave = 0.8 * np.sin(1.5 * T + seed)
     velocity = np.outer(wave, [0.0, 1.0, 0.0])
@@ -75,7 +75,7 @@ def test_gyros_are_not_contradicted_by_waves_beside_gaps(seed: int):
 
 
 @pytest.mark.parametrize(("seed", "waves_m_s2"), [(0, 0.0), (0, 3.0), (1, 3.0)])
-def test_right_gyros_are_not_contradicted(seed: int, waves_m_s2: float):
+def test_right_gyros_are_not_contradicted(seed, waves_m_s2):
     """Also by accelerations of either level axis that the velocities, 5 a second and noisy, do not show."""
     run = level_drive(seed, phase=0.8 * seed)
     if waves_m_s2:

@@ -120,14 +120,14 @@ def test_a_bias_of_the_accelerometers_is_told_from_gravity_as_the_vehicle_turns(
     assert not acting(recalibrated(biased, "imu", **known))
 
 
-def test_a_start_that_is_tilted_like_a_turned_imu_decides_nothing() -> None:
+def test_a_start_that_is_tilted_like_a_turned_imu_decides_nothing():
     """It may have been read off that IMU: its gravity fits, and the Doppler log would be blamed."""
     run = with_turned(swaying(), "imu", 0.2, "x")
     finding, *_ = grave(recalibrated(run, "start", rpy_rad=(-0.2, 0.0, 0.0)))
     assert "no other sensor shows which" in finding.advice
 
 
-def test_mountings_that_are_right_within_two_degrees_are_left_alone() -> None:
+def test_mountings_that_are_right_within_two_degrees_are_left_alone():
     assert grave(with_turned(swaying(), "dvl", 0.03, "x")) == []
 
 

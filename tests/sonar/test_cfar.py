@@ -202,22 +202,3 @@ def test_a_design_is_let_through_where_the_selection_finds_its_figure(design, co
     refused = pytest.raises(CalibrationError, match=words)
     with nullcontext() if count else refused:
         cfar.check_candidates([design], cfar.DetectionParams(), SEARCH_M)
-
-
-@pytest.mark.parametrize(
-    ("design", "search_m", "settings", "words"),
-    [
-        (
-            design_of((-0.2, 0.0, 0.1, 0.1), (0.2, 0.0, 0.06, 0.06), size_m=0.7),
-            0.045,
-            {"max_area_m2": 0.03},
-            r" m² with its centre 40 cm .* within 4.5 cm of .*closing_m",
-        ),
-        (TINY, SEARCH_M, {"smoothing_m": 0.1}, "all smoothed away; one must have"),
-    ],
-)
-def test_a_refusal_names_areas_distances_limits_and_settings(
-    design, search_m, settings, words
-):
-    with pytest.raises(CalibrationError, match=words):
-        cfar.check_candidates([design], cfar.DetectionParams(**settings), search_m)
