@@ -70,9 +70,7 @@ def test_signs_of_the_doppler_log_are_found_and_the_gyros_left_alone(axes):
 
 @pytest.mark.parametrize("signs", [(1, 1), (1, -1)])
 @pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2]])
-def test_level_axes_of_the_accelerometers_are_found_with_a_doppler_log_on_a_long_arm(
-    signs, order
-):
+def test_axes_of_accelerometers_are_found_beside_a_log_on_a_long_arm(signs, order):
     """Rates and velocities agree and so does the arm between them: in the forces' axes it is turned as they are."""
     S = np.diag([*signs, 1.0])[order]
     arm_m = np.array([0.6, 0.4, 0.2])

@@ -344,7 +344,7 @@ def test_of_two_that_run_against_each_other_the_right_one_is_not_asked(wrong):
 
 
 @pytest.mark.parametrize("has_sightings", [True, False])
-def test_a_clockwise_heading_on_a_straight_way_blames_no_doppler_log_that_fits(
+def test_a_clockwise_heading_blames_no_doppler_log_that_fits(
     has_sightings,
 ):
     run = diving((1, 1, 1), start_z_m=0.0)
@@ -405,7 +405,7 @@ def test_a_scale_of_the_heading_is_told_from_one_of_the_gyros_by_the_fixes(role,
 
 
 @pytest.mark.parametrize("felt", ["always", "but for a hole", "but for two"])
-def test_velocities_that_change_where_no_force_was_measured_have_lost_nothing(felt):
+def test_velocities_that_change_where_no_force_is_known_have_lost_nothing(felt):
     """The vehicle speeds up in 4 s. Between two holes of the accelerometers no velocity is measured."""
     run = observed()
     ahead = [1.0, 0.0, 0.0]

@@ -137,7 +137,7 @@ def test_a_dive_towards_landmarks_is_no_scale_of_their_ranges(climb_m_s, is_sure
     assert (gain.sigma < 0.01) == is_sure
 
 
-def test_heave_that_has_nothing_to_do_with_the_ranges_leaves_their_gain_sure():
+def test_heave_that_the_ranges_do_not_show_leaves_their_gain_sure():
     """A dz that is as often up as down while a landmark comes nearer adds nothing: sum dz dr of a passage is small."""
     longer = np.full(40, -0.5)
     passage = np.zeros(40, dtype=np.int64)

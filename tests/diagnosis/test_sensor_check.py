@@ -435,8 +435,7 @@ def test_a_slow_log_that_is_upside_down_is_named_by_the_depths(sense):
     climb_m_s = 0.7 * np.sin(2 * np.pi * t / 35.0)
     level_m_s = [0.05 + 0.02 * np.sin(0.2 * t), 0.02 * np.sin(0.15 * t + 1.0)]
     velocity = np.column_stack([*level_m_s, climb_m_s])
-    run = level_vehicle(velocity, 0.1 * np.sin(0.12 * t), 0)
-    run = replace(run, dvl=run.dvl.rows(slice(0, None, 5)))
+    run = level_vehicle(velocity, 0.1 * np.sin(0.12 * t), 0, every=5)
     noise_m = 0.005 * np.random.default_rng(1).standard_normal(len(t) // 10)
     run = with_depth(run, (np.cumsum(climb_m_s) * 0.02 - 20.0)[::10] + noise_m, 1e-4)
     found = grave(spoilt(run, "dvl", velocity=run.dvl.velocity * sense))

@@ -104,7 +104,7 @@ def test_a_stated_start_shows_which_is_rolled_or_pitched(
     assert (roll_rad and pitch_rad) or abs(angles_rad[2]) < 0.02
 
 
-def test_a_bias_of_the_accelerometers_is_told_from_gravity_as_the_vehicle_turns():
+def test_a_bias_of_accelerometers_is_told_from_gravity_by_turns():
     """Its line, in the axes of an IMU that is turned on the vehicle, takes it away for all that follows."""
     run = swaying()
     bias_m_s2 = (0.1, -0.4, 0.0)

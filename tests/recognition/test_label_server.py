@@ -195,46 +195,52 @@ def click_two(browser, address: str, before: int) -> None:
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
+    press = page.keyboard.press
+    locate = page.locator
     page.goto(address)
-    status = page.locator("#said")
+    status = locate("#said")
     until(lambda: page.evaluate("document.getElementById('picture').naturalWidth") > 0)
     if before:
         until(lambda: status.text_content() == f"{before} labels so far")
     frame = 1 + before // 2
+
+    def is_at(number: int) -> bool:
+        return locate("#where").text_content().startswith(f"{number} of ")
+
     for _ in range(frame):
-        page.keyboard.press("ArrowRight")
-    page.keyboard.press("PageDown")
-    page.keyboard.press("PageUp")
-    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 1} of "))
-    page.keyboard.press("3")
-    assert page.locator("input[value='3']").is_checked()
-    box = page.locator("#picture").bounding_box()
+        press("ArrowRight")
+    press("PageDown")
+    press("PageUp")
+    until(lambda: is_at(frame + 1))
+    press("3")
+    assert locate("input[value='3']").is_checked()
+    box = locate("#picture").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.click(*middle)
     until(lambda: status.text_content() == f"saved: {before + 1} labels")
-    page.keyboard.press("0")
+    press("0")
     page.mouse.click(middle[0], middle[1] + 90)
     page.mouse.click(middle[0], middle[1] - 90)
     until(lambda: status.text_content() == f"saved: {before + 3} labels")
-    page.keyboard.press("Backspace")
+    press("Backspace")
     until(lambda: status.text_content() == f"saved: {before + 2} labels")
-    assert page.locator("#marks circle").count() == 2
-    mark = page.locator("#marks circle").nth(0).bounding_box()
+    assert locate("#marks circle").count() == 2
+    mark = locate("#marks circle").nth(0).bounding_box()
     assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
     assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
     held: list = []
     # a picture that is long in coming
     page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))
-    page.keyboard.press("ArrowRight")
-    until(lambda: page.locator("#frame").input_value() == f"{frame + 1}")
-    page.keyboard.press("3")
+    press("ArrowRight")
+    until(lambda: locate("#frame").input_value() == f"{frame + 1}")
+    press("3")
     page.mouse.click(*middle)  # of the picture that is shown, whose label it replaces
     page.wait_for_timeout(200)
-    assert page.locator("#where").text_content().startswith(f"{frame + 1} of ")
-    assert page.locator("#marks text").all_text_contents() == ["none", "3"]
+    assert is_at(frame + 1)
+    assert locate("#marks text").all_text_contents() == ["none", "3"]
     held[0].continue_()
-    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 2} of "))
-    assert page.locator("#marks circle").count() == 0
+    until(lambda: is_at(frame + 2))
+    assert locate("#marks circle").count() == 0
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 900})
         assert page.evaluate("document.documentElement.scrollWidth") <= width
