@@ -102,7 +102,7 @@ SWAY = 0.15 * np.pi * np.cos(0.5 * np.pi * T)
 """To and fro in four seconds."""
 
 
-def test_a_late_compass_of_a_vehicle_that_turns_back_at_once_has_not_jumped():
+def test_a_late_compass_of_a_vehicle_that_turns_back_has_not_jumped():
     """Where the turn is reversed, a late heading leaves the gyros within a row."""
     (found,) = acting(turning(np.tanh(20.0 * np.sin(0.1 * T)), 0.0, late_s=0.6))
     assert found.quantity == "heading against the gyros: delay"
@@ -132,7 +132,7 @@ def test_a_turn_that_no_bias_of_gyros_makes_is_the_headings(drift_rad_s, named):
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
-def test_turns_between_rows_of_a_slow_doppler_log_are_no_scale_of_the_gyros(scale):
+def test_turns_between_rows_of_a_slow_log_are_no_scale_of_the_gyros(scale):
     """The vehicle yaws with a period of four rows."""
     run = turning(SWAY, every=5)
     rate = scale * run.imu.angular_velocity
