@@ -162,6 +162,8 @@ def test_matrix_is_the_posterior_mean_of_the_scores_of_each_class():
     np.testing.assert_allclose(model.matrix, (trials * mean + 0.5) / (trials + 1.5))
     assert model.provenance["origin"] == "made up"
     assert model.provenance["frames of landmark 1"] == "100"
+    sigmas = model.range_sigma_m, model.across_sigma_m
+    assert sigmas == pytest.approx((0.01, 0.002), rel=0.2)
 
 
 def some(
