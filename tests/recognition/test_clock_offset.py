@@ -55,6 +55,7 @@ def test_an_offset_is_found_within_its_sigma(lane, steps, offset_s, search):
     found = estimated(lane, steps, offset_s, **search)
     assert abs(found.seconds - offset_s) < 3 * found.sigma_s + 0.01
     assert found.sigma_s < 0.1
+    assert min(found.correlations) > 0.9
     assert re.match(
         r"[+-]\d+\.\d{3} s ± 0\.\d{3} s \(1 sigma\), from \d+ steps", str(found)
     )
