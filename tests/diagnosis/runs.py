@@ -10,7 +10,15 @@ import numpy as np
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.diagnosis import Finding, check_sensors
 from sonar_graph.logs.adapters import LogConfig
-from sonar_graph.measurements import Dvl, Floats, Heading, Imu, Ints, PositionFixes
+from sonar_graph.measurements import (
+    Depth,
+    Dvl,
+    Floats,
+    Heading,
+    Imu,
+    Ints,
+    PositionFixes,
+)
 from sonar_graph.sequence import Sequence
 
 
@@ -64,8 +72,19 @@ def fix_rows(stamps_ns: Ints, position_m: Floats) -> PositionFixes:
     return PositionFixes(stamps_ns, position_m, unstated(len(stamps_ns), 3, 3))
 
 
-def level_vehicle(velocity: Floats, yaw_rate: Floats, seed: int) -> Sequence:
-    """A level vehicle by hand, its velocity in the body and its yaw rate at 50 Hz: ``f = dv/dt + w x v + g``, with noise."""
+def with_depth(run: Sequence, z_m: Floats, variance_m2: float = np.nan) -> Sequence:
+    """The run with depths at every tenth row of the IMU."""
+    stamps_ns = run.imu.stamps_ns[::10]
+    return replace(run, depth=Depth(stamps_ns, z_m, np.full(len(z_m), variance_m2)))
+
+
+def level_vehicle(
+    velocity: Floats, yaw_rate: Floats, seed: int, every: int = 1
+) -> Sequence:
+    """A level vehicle by hand, its velocity in the body and its yaw rate at 50 Hz: ``f = dv/dt + w x v + g``, with noise.
+
+    The Doppler log has 5 rows a second, or ``every`` so many of them.
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(len(velocity)) / 50.0
     stamps_ns = np.rint(t * 1e9).astype(np.int64)
@@ -77,7 +96,7 @@ def level_vehicle(velocity: Floats, yaw_rate: Floats, seed: int) -> Sequence:
     slow = slice(None, None, 10)
     noisy = velocity[slow] + 0.01 * rng.standard_normal(velocity[slow].shape)
     imu = Imu(stamps_ns, rate, force)
-    dvl = dvl_rows(stamps_ns[slow], noisy)
+    dvl = dvl_rows(stamps_ns[slow], noisy).rows(slice(0, None, every))
     return Sequence("by hand", Calibration(), imu, dvl)
 
 

@@ -20,7 +20,6 @@ from .runs import grave, names, started
 BASIN = simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1))
 UNKNOWN = replace(BASIN, truth=None)
 PLACE = BASIN.calibration.start.position_m
-YAW_RAD = BASIN.calibration.start.rpy_rad[2]
 
 
 def stated(
@@ -29,8 +28,8 @@ def stated(
     """The right start, moved and turned."""
     return Start(
         rpy_sigma_rad=(0.01, 0.01, yaw_sigma_rad),
-        position_m=(PLACE[0] + east_m, PLACE[1], PLACE[2]),
-        rpy_rad=(*BASIN.calibration.start.rpy_rad[:2], YAW_RAD + turn_rad),
+        position_m=tuple(np.add(PLACE, [east_m, 0.0, 0.0])),
+        rpy_rad=tuple(np.add(BASIN.calibration.start.rpy_rad, [0.0, 0.0, turn_rad])),
     )
 
 

@@ -15,6 +15,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
+from unittest.mock import Mock
 
 import pytest
 
@@ -34,6 +35,9 @@ BROWSER = next(
 IDS = [1, 2, 3, 4]
 
 
+CLICK = {"frame": 1, "column": 300, "row": 300, "id": 2}
+
+
 @pytest.fixture(scope="module")
 def frames(lane) -> list[ShownFrame]:
     blocks = [lane.one(row) for row in range(20)]
@@ -45,12 +49,9 @@ def frames(lane) -> list[ShownFrame]:
 @pytest.fixture
 def server(frames, tmp_path) -> Iterator[LabelServer]:
     desk = LabelDesk(frames, Labels(log="lane.mcap"), tmp_path / "labels.json")
-    with LabelServer(
-        desk, lambda nonce: f"<script nonce={nonce}></script>", IDS
-    ) as made:
-        Thread(
-            target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True
-        ).start()
+    page = "<script nonce={}></script>".format
+    with LabelServer(desk, page, IDS) as made:
+        Thread(target=made.serve_forever, args=[0.01], daemon=True).start()
         yield made
         made.shutdown()
 
@@ -71,6 +72,16 @@ def ask(
             return error.code, error.read()
 
 
+def told(server: LabelServer, path: str, content: object) -> dict:
+    return json.loads(ask(server, path, content)[1])
+
+
+def saved(tmp_path: Path) -> list[int | None]:
+    """Landmarks of the labels in the file."""
+    labels = read_labels(tmp_path / "labels.json", Path("lane.mcap")).labels
+    return [label.id for label in labels]
+
+
 def test_only_who_knows_the_word_and_names_the_host_is_answered(server):
     other = f"http://{server.host}/"
     assert ask(server, "")[0] == 200
@@ -84,16 +95,14 @@ def test_only_who_knows_the_word_and_names_the_host_is_answered(server):
     ):
         assert ask(server, path)[0] == 404
     assert ask(server, "state", Host="evil.example")[0] == 404
-    click = {"frame": 0, "column": 150, "row": 300, "id": 1}
-    assert ask(server, f"{other}label", click)[0] == 404
-    assert ask(server, "label", click, Origin="http://evil.example")[0] == 400
-    assert ask(server, "label", click, **{"Content-Type": "text/plain"})[0] == 400
+    assert ask(server, f"{other}label", CLICK)[0] == 404
+    assert ask(server, "label", CLICK, Origin="http://evil.example")[0] == 400
+    assert ask(server, "label", CLICK, **{"Content-Type": "text/plain"})[0] == 400
     assert server.desk.labels == ()
     assert server.server_address[0] == "127.0.0.1"
 
 
 def test_requests_that_make_no_sense_are_refused(server):
-    click = {"frame": 0, "column": 150, "row": 300, "id": 1}
     for changed in (
         {"frame": 99},
         {"frame": -1},
@@ -102,41 +111,30 @@ def test_requests_that_make_no_sense_are_refused(server):
         {"id": 9},
         {"id": [1]},
         {"row": None},
+        {"frame": "1" * 20_000},
     ):
-        assert ask(server, "label", click | changed)[0] == 400
+        assert ask(server, "label", CLICK | changed)[0] == 400
     assert ask(server, "label", [1])[0] == 400
-    assert ask(server, "label", {"frame": "1" * 20_000})[0] == 400
-    assert (
-        ask(server, "frame/99")[0]
-        == ask(server, "frame/-1")[0]
-        == ask(server, "labels", click)[0]
-        == 404
-    )
+    for path, content in (("frame/99", None), ("frame/-1", None), ("labels", CLICK)):
+        assert ask(server, path, content)[0] == 404
     assert server.desk.labels == ()
 
 
 def test_each_click_is_saved_and_can_be_taken_back(server, tmp_path):
-    click = {"frame": 1, "column": 300, "row": 300, "id": 2}
-    assert json.loads(ask(server, "label", click)[1])["total"] == 1
-    state = json.loads(ask(server, "label", click | {"id": None, "frame": 2})[1])
+    assert told(server, "label", CLICK)["total"] == 1
+    state = told(server, "label", CLICK | {"id": None, "frame": 2})
     assert [len(labels) for labels in state["frames"][:4]] == [0, 1, 1, 0]
     assert abs(state["frames"][1][0]["column"] - 300) <= 1
-    saved = read_labels(tmp_path / "labels.json", Path("lane.mcap"))
-    assert [label.id for label in saved.labels] == [2, None]
-    assert saved.labels[0].stamp_ns == server.desk.frames[1].stamp_ns
-    assert (
-        json.loads(ask(server, "label", click | {"column": 0, "row": 600})[1])["fault"]
-        == "outside of the image"
-    )
-    assert json.loads(ask(server, "take-back", {"frame": 2})[1])["total"] == 1
-    assert (
-        json.loads(ask(server, "take-back", {"frame": 2})[1])["fault"]
-        == "no label in this frame"
-    )
-    assert [
-        label.id
-        for label in read_labels(tmp_path / "labels.json", Path("lane.mcap")).labels
-    ] == [2]
+    assert saved(tmp_path) == [2, None]
+    first = server.desk.labels[0]
+    assert first.stamp_ns == server.desk.frames[1].stamp_ns
+    outside = CLICK | {"column": 0, "row": 600}
+    assert told(server, "label", outside)["fault"] == "outside of the image"
+    of_second = {"frame": 2}
+    assert told(server, "take-back", of_second)["total"] == 1
+    fault = told(server, "take-back", of_second)["fault"]
+    assert fault == "no label in this frame"
+    assert saved(tmp_path) == [2]
 
 
 def test_a_label_on_one_of_the_same_frame_takes_its_place(server):
@@ -147,21 +145,14 @@ def test_a_label_on_one_of_the_same_frame_takes_its_place(server):
         (2, 4, 1.5),
         (1, 1, 1.52),
     ):
-        assert (
-            desk.add(frame, *desk.frames[frame].fan.pixel(range_m, 0.0), landmark)
-            is None
-        )
+        pixel = desk.frames[frame].fan.pixel(range_m, 0.0)
+        assert desk.add(frame, *pixel, landmark) is None
     assert [label.id for label in desk.labels] == [3, 4, 1]
 
 
 def test_what_cannot_be_saved_is_said_and_not_kept(server, monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError("no space left")
-
-    monkeypatch.setattr(Labels, "write", full)
-    answer = json.loads(
-        ask(server, "label", {"frame": 1, "column": 300, "row": 300, "id": 2})[1]
-    )
+    monkeypatch.setattr(Labels, "write", Mock(side_effect=OSError("no space left")))
+    answer = told(server, "label", CLICK)
     assert answer["fault"] == "not saved: no space left"
     assert answer["total"] == 0
 
@@ -174,30 +165,20 @@ def test_landmarks_are_clicked_in_a_browser_and_kept_over_ctrl_c(lane_log, tmp_p
         reason="playwright is not installed: pip install playwright",
     )
     out = tmp_path / "labels.json"
+    python = [sys.executable, "-m", "sonar_graph"]
+    words = [*python, "label", str(lane_log), "-o", str(out), "--no-browser"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     for before in (0, 2):
-        words = [
-            sys.executable,
-            "-m",
-            "sonar_graph",
-            "label",
-            str(lane_log),
-            "-o",
-            str(out),
-            "--no-browser",
-        ]
-        command = subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        command = subprocess.Popen(words, **pipes)
         try:
             line = command.stdout.readline()
             assert f"{before} labels so far" in line
+            address = re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)[0]
             with sync_api.sync_playwright() as playwright:
                 browser = playwright.chromium.launch(
                     executable_path=BROWSER, args=["--no-sandbox"]
                 )
-                click_two(
-                    browser, re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)[0], before
-                )
+                click_two(browser, address, before)
                 browser.close()
             command.send_signal(signal.SIGINT)
             said, complaints = command.communicate(timeout=20)
@@ -214,46 +195,52 @@ def click_two(browser, address: str, before: int) -> None:
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
+    press = page.keyboard.press
+    locate = page.locator
     page.goto(address)
-    status = page.locator("#said")
+    status = locate("#said")
     until(lambda: page.evaluate("document.getElementById('picture').naturalWidth") > 0)
     if before:
         until(lambda: status.text_content() == f"{before} labels so far")
     frame = 1 + before // 2
+
+    def is_at(number: int) -> bool:
+        return locate("#where").text_content().startswith(f"{number} of ")
+
     for _ in range(frame):
-        page.keyboard.press("ArrowRight")
-    page.keyboard.press("PageDown")
-    page.keyboard.press("PageUp")
-    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 1} of "))
-    page.keyboard.press("3")
-    assert page.locator("input[value='3']").is_checked()
-    box = page.locator("#picture").bounding_box()
+        press("ArrowRight")
+    press("PageDown")
+    press("PageUp")
+    until(lambda: is_at(frame + 1))
+    press("3")
+    assert locate("input[value='3']").is_checked()
+    box = locate("#picture").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.click(*middle)
     until(lambda: status.text_content() == f"saved: {before + 1} labels")
-    page.keyboard.press("0")
+    press("0")
     page.mouse.click(middle[0], middle[1] + 90)
     page.mouse.click(middle[0], middle[1] - 90)
     until(lambda: status.text_content() == f"saved: {before + 3} labels")
-    page.keyboard.press("Backspace")
+    press("Backspace")
     until(lambda: status.text_content() == f"saved: {before + 2} labels")
-    assert page.locator("#marks circle").count() == 2
-    mark = page.locator("#marks circle").nth(0).bounding_box()
+    assert locate("#marks circle").count() == 2
+    mark = locate("#marks circle").nth(0).bounding_box()
     assert abs(mark["x"] + mark["width"] / 2 - middle[0]) < 3
     assert abs(mark["y"] + mark["height"] / 2 - middle[1]) < 3
     held: list = []
     # a picture that is long in coming
     page.route(f"**/frame/{frame + 1}", lambda route: held.append(route))
-    page.keyboard.press("ArrowRight")
-    until(lambda: page.locator("#frame").input_value() == f"{frame + 1}")
-    page.keyboard.press("3")
+    press("ArrowRight")
+    until(lambda: locate("#frame").input_value() == f"{frame + 1}")
+    press("3")
     page.mouse.click(*middle)  # of the picture that is shown, whose label it replaces
     page.wait_for_timeout(200)
-    assert page.locator("#where").text_content().startswith(f"{frame + 1} of ")
-    assert page.locator("#marks text").all_text_contents() == ["none", "3"]
+    assert is_at(frame + 1)
+    assert locate("#marks text").all_text_contents() == ["none", "3"]
     held[0].continue_()
-    until(lambda: page.locator("#where").text_content().startswith(f"{frame + 2} of "))
-    assert page.locator("#marks circle").count() == 0
+    until(lambda: is_at(frame + 2))
+    assert locate("#marks circle").count() == 0
     for width in (390, 1280):
         page.set_viewport_size({"width": width, "height": 900})
         assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -46,111 +47,91 @@ MOUNTED = Calibration(
 
 
 BODY_T_SONAR = MOUNTED.sonar.mounting.pose()
-SECOND_NS = 10**9
 
 
 def exact_run(path: VehiclePath, calibration: Calibration = MOUNTED) -> Sequence:
     """Sensors without any noise, and a start that is true."""
-    imu_ns, dvl_ns, depth_ns = (
-        regular_stamps(rate, path.duration_s) for rate in (100.0, 20.0, 10.0)
+    stamps = [regular_stamps(hz, path.duration_s) for hz in (100.0, 20.0, 10.0)]
+    imu, dvl, depth = (path.at(seconds_since_start(ns)) for ns in stamps)
+    imu_ns, dvl_ns, depth_ns = stamps
+    start = Start(
+        position_m=tuple(imu.position[0].tolist()),
+        rpy_rad=tuple(rpy_from_rotation(imu.world_R_body[:1])[0].tolist()),
     )
-    imu, dvl, depth, start = (
-        path.at(seconds_since_start(ns))
-        for ns in (imu_ns, dvl_ns, depth_ns, imu_ns[:1])
-    )
-    rpy_rad = rpy_from_rotation(start.world_R_body)[0]
-    begin = Start(
-        position_m=tuple(start.position[0].tolist()), rpy_rad=tuple(rpy_rad.tolist())
-    )
-    calibration = calibration.model_copy(update={"start": begin})
-    port = depth.position + depth.world_R_body.apply(np.array(calibration.depth.port_m))
+    port = depth.position + depth.world_R_body.apply(calibration.depth.port_m)
     velocity_cov = np.tile(np.eye(3) * 1e-6, (len(dvl_ns), 1, 1))
     return Sequence(
         "exact",
-        calibration,
+        calibration.model_copy(update={"start": start}),
         imu=Imu(imu_ns, *imu_readings(imu, calibration.imu.mounting, 9.80665)),
         dvl=Dvl(dvl_ns, dvl_readings(dvl, calibration.dvl.mounting), velocity_cov),
         depth=Depth(depth_ns, port[:, 2], np.full(len(depth_ns), np.nan)),
     )
 
 
-@pytest.fixture(scope="module")
-def path() -> VehiclePath:
-    """It wanders by decimetres and sways by degrees."""
-    seconds = np.linspace(0, 20, 41)
-    sway = smooth_noise(
-        seconds,
-        np.array([0.6, 0.6, 0.2, 0.1, 0.1, 0.6]),
-        4.0,
-        6,
-        np.random.default_rng(4),
-    )
-    return VehiclePath.through(seconds, sway + np.array([0, 0, -0.7, 0, 0, 0]))
+SECONDS = np.linspace(0, 20, 41)
 
 
-@pytest.fixture(scope="module")
-def exact(path) -> Sequence:
-    return exact_run(path)
+SWAY = smooth_noise(
+    SECONDS,
+    np.array([0.6, 0.6, 0.2, 0.1, 0.1, 0.6]),
+    4.0,
+    6,
+    np.random.default_rng(4),
+)
 
 
-def sonar_poses(path: VehiclePath, stamps_ns: list[int]) -> list[gtsam.Pose3]:
+PATH = VehiclePath.through(SECONDS, np.add(SWAY, [0, 0, -0.7, 0, 0, 0]))
+"""It wanders by decimetres and sways by degrees."""
+
+
+EXACT = exact_run(PATH)
+
+
+def sonar_poses(stamps_ns: list[int]) -> list[gtsam.Pose3]:
     """world_T_sonar by the simulator's truth."""
-    motion = path.at(seconds_since_start(np.array(stamps_ns)))
+    motion = PATH.at(seconds_since_start(np.array(stamps_ns)))
     bodies = zip(motion.world_R_body.as_matrix(), motion.position, strict=True)
-    return [
-        gtsam.Pose3(gtsam.Rot3(rotation), position).compose(BODY_T_SONAR)
-        for rotation, position in bodies
-    ]
+    return [gtsam.Pose3(gtsam.Rot3(R), t) * BODY_T_SONAR for R, t in bodies]
 
 
-def frames_of(sequence: Sequence, count: int = 40) -> list[int]:
+def frames_of(count: int = 40) -> list[int]:
     """Between the stamps of all sensors."""
-    return (sequence.start_ns + 37_100_000 + 230_000_000 * np.arange(count)).tolist()
+    return (EXACT.start_ns + 37_100_000 + 230_000_000 * np.arange(count)).tolist()
 
 
 def along(
     sequence: Sequence, stamps_ns: list[int]
-) -> tuple[list[SonarStep | None], list[FloorView | None]]:
+) -> tuple[tuple[SonarStep | None, ...], tuple[FloorView, ...]]:
     motions = SonarMotions(sequence)
-    steps, views = zip(*(motions.at(stamp_ns) for stamp_ns in stamps_ns), strict=True)
-    return list(steps), list(views)
+    return tuple(zip(*map(motions.at, stamps_ns), strict=True))
 
 
-def views_after(sequence: Sequence, *seconds: float) -> list[FloorView]:
+def views_after(sequence: Sequence, *seconds: float) -> tuple[FloorView, ...]:
     """Views of the floor at these times since the start."""
-    return along(sequence, [sequence.start_ns + round(s * SECOND_NS) for s in seconds])[
-        1
-    ]
+    return along(sequence, [sequence.start_ns + round(s * 1e9) for s in seconds])[1]
 
 
-def joined(steps: list[SonarStep]) -> gtsam.Pose3:
-    pose = gtsam.Pose3()
-    for step in steps:
-        pose = pose.compose(step.previous_T_sonar)
-    return pose
-
-
-def test_motion_tilt_and_height_are_those_of_the_simulators_truth(path, exact):
-    poses = sonar_poses(path, frames_of(exact))
-    (first, *steps), views = along(exact, frames_of(exact))
+def test_motion_tilt_and_height_are_those_of_the_simulators_truth():
+    poses = sonar_poses(frames_of())
+    (first, *steps), (_, *views) = along(EXACT, frames_of())
     assert first is None
-    for before, here, step, found in zip(
-        poses, poses[1:], steps, views[1:], strict=False
-    ):
-        assert (
-            np.abs(before.between(here).localCoordinates(step.previous_T_sonar)).max()
-            < 1e-3
-        )
+    joined = gtsam.Pose3()
+    for (before, here), step, found in zip(pairwise(poses), steps, views, strict=True):
+        off = before.between(here).localCoordinates(step.previous_T_sonar)
+        assert np.abs(off).max() < 1e-3
         view = FloorView.from_pose(here, FLOOR_Z_M)
         np.testing.assert_allclose(found.level_R_sonar, view.level_R_sonar, atol=2e-3)
         assert found.height_m == pytest.approx(view.height_m, abs=5e-3)
+        joined = joined * step.previous_T_sonar
     moved = poses[0].between(poses[-1]).translation()
-    np.testing.assert_allclose(joined(steps).translation(), moved, atol=5e-3)
+    np.testing.assert_allclose(joined.translation(), moved, atol=5e-3)
     assert np.linalg.norm(moved) > 0.1
 
 
-def numbers(steps: list[SonarStep | None], views: list[FloorView]) -> Floats:
+def numbers(sequence: Sequence, stamps_ns: list[int]) -> Floats:
     """All results of each frame but the motion of the first, one row a frame."""
+    steps, views = along(sequence, stamps_ns)
     moved = [
         np.append(s.previous_T_sonar.matrix(), s.covariance) if s else np.zeros(52)
         for s in steps
@@ -162,41 +143,38 @@ def numbers(steps: list[SonarStep | None], views: list[FloorView]) -> Floats:
     return np.hstack([moved, seen])
 
 
-def test_nothing_stamped_after_a_frame_influences_it(exact):
+MEASURED = {
+    "imu": ("angular_velocity", "specific_force"),
+    "dvl": ("velocity", "velocity_cov"),
+    "depth": ("z_m",),
+}
+
+
+def test_nothing_stamped_after_a_frame_influences_it():
     """Also of one that falls on a Doppler stamp, between rows of the IMU."""
-    exact = replace(
-        exact, imu=replace(exact.imu, stamps_ns=exact.imu.stamps_ns + 3_000_000)
-    )
-    stamps_ns = [*frames_of(exact, 12), *exact.dvl.stamps_ns[60:63].tolist()]
-    expected = numbers(*along(exact, stamps_ns))
+    imu = replace(EXACT.imu, stamps_ns=EXACT.imu.stamps_ns + 3_000_000)
+    run = replace(EXACT, imu=imu)
+    stamps_ns = [*frames_of(12), *run.dvl.stamps_ns[60:63].tolist()]
+    expected = numbers(run, stamps_ns)
     for k in (0, 5, 12, 14):
-        spoiled = numbers(*along(_spoiled_after(exact, stamps_ns[k]), stamps_ns))
+        changed = {}
+        for role, names in MEASURED.items():
+            rows = getattr(run, role)
+            off = 3.0 * (rows.stamps_ns > stamps_ns[k])
+            columns = {name: (getattr(rows, name).T + off).T for name in names}
+            changed[role] = replace(rows, **columns)
+        spoiled = numbers(replace(run, **changed), stamps_ns)
         np.testing.assert_array_equal(spoiled[: k + 1], expected[: k + 1])
         assert k == 14 or np.abs(spoiled - expected)[-1].max() > 0.1
-
-
-def _spoiled_after(run: Sequence, stamp_ns: int) -> Sequence:
-    def wrong(block: Imu | Dvl | Depth, *names: str) -> Imu | Dvl | Depth:
-        later = np.flatnonzero(block.stamps_ns > stamp_ns)
-        changed = {name: getattr(block, name).copy() for name in names}
-        for values in changed.values():
-            values[later] += 3.0
-        return replace(block, **changed)
-
-    imu = wrong(run.imu, "angular_velocity", "specific_force")
-    dvl = wrong(run.dvl, "velocity", "velocity_cov")
-    return replace(run, imu=imu, dvl=dvl, depth=wrong(run.depth, "z_m"))
 
 
 def at_rest(
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0), **calibration: object
 ) -> Sequence:
     """A vehicle that does not move."""
-    poses = np.tile(np.array([1.0, 2.0, -0.7, *rpy_rad]), (41, 1))
-    return exact_run(
-        VehiclePath.through(np.linspace(0, 20, 41), poses),
-        MOUNTED.model_copy(update=calibration),
-    )
+    poses = np.tile([1.0, 2.0, -0.7, *rpy_rad], (41, 1))
+    known = MOUNTED.model_copy(update=calibration)
+    return exact_run(VehiclePath.through(SECONDS, poses), known)
 
 
 def with_start(run: Sequence, **changes: object) -> Sequence:
@@ -205,24 +183,16 @@ def with_start(run: Sequence, **changes: object) -> Sequence:
 
 
 @pytest.mark.parametrize("is_force_measured", [True, False])
-def test_gravity_corrects_a_start_that_is_tilted_wrongly(is_force_measured: bool):
+def test_gravity_corrects_a_start_that_is_tilted_wrongly(is_force_measured):
     """Without accelerometers (negative control) the error stays."""
-    run = with_start(
-        at_rest((0.05, -0.1, 1.0)),
-        rpy_rad=(0.0, 0.0, 1.0),
-        rpy_sigma_rad=(0.1, 0.1, 0.1),
-    )
+    level = {"rpy_rad": (0.0, 0.0, 1.0), "rpy_sigma_rad": (0.1, 0.1, 0.1)}
+    run = with_start(at_rest((0.05, -0.1, 1.0)), **level)
     if not is_force_measured:
-        run = replace(
-            run,
-            imu=replace(
-                run.imu, specific_force=np.full_like(run.imu.specific_force, np.nan)
-            ),
-        )
+        force = np.full_like(run.imu.specific_force, np.nan)
+        run = replace(run, imu=replace(run.imu, specific_force=force))
     first, _, last = views_after(run, 0, 2, 10)
-    up = (
-        BODY_T_SONAR.rotation().matrix().T
-        @ gtsam.Rot3.RzRyRx(0.05, -0.1, 0.0).matrix().T[:, 2]
+    up = BODY_T_SONAR.rotation().unrotate(
+        gtsam.Rot3.RzRyRx(0.05, -0.1, 0.0).matrix()[2]
     )
     off = [np.linalg.norm(view.level_R_sonar[2] - up) for view in (first, last)]
     assert off[0] == pytest.approx(np.hypot(0.05, 0.1), rel=0.02)
@@ -237,46 +207,38 @@ def test_gravity_corrects_a_start_that_is_tilted_wrongly(is_force_measured: bool
 
 def test_tilt_is_as_uncertain_as_gyros_make_it():
     """Between two looks at gravity: white noise and a bias, from the start's variance."""
-    imu = MOUNTED.imu.model_copy(
-        update={"gyro_bias_sigma": 0.003, "gyro_noise_density": 0.002}
-    )
-    run = with_start(
-        at_rest(imu=imu, use_gravity=False), rpy_sigma_rad=(0.01, 0.02, 0.5)
-    )
-    (view,) = views_after(run, 0.8)
-    assert view.tilt_sigma_rad**2 == pytest.approx(
-        0.02**2 + 0.002**2 * 0.8 + (0.003 * 0.8) ** 2, rel=1e-6
-    )
+    noise = {"gyro_bias_sigma": 0.003, "gyro_noise_density": 0.002}
+    run = at_rest(imu=MOUNTED.imu.model_copy(update=noise), use_gravity=False)
+    (view,) = views_after(with_start(run, rpy_sigma_rad=(0.01, 0.02, 0.5)), 0.8)
+    expected = 0.02**2 + 0.002**2 * 0.8 + (0.003 * 0.8) ** 2
+    assert view.tilt_sigma_rad**2 == pytest.approx(expected, rel=1e-6)
 
 
 def test_depth_corrects_a_start_that_is_too_high_by_the_variances_of_both():
     """By hand; a sample may state its own variance."""
-    run = with_start(
-        at_rest(), position_m=(1.0, 2.0, -0.4), position_sigma_m=(0.1, 0.1, 0.1)
-    )
+    high = {"position_m": (1.0, 2.0, -0.4), "position_sigma_m": (0.1, 0.1, 0.1)}
+    run = with_start(at_rest(), **high)
     before, after = views_after(run, 0, 1e-9)
     start_m = -0.4 + BODY_T_SONAR.translation()[2] - FLOOR_Z_M
     assert before.height_m == pytest.approx(start_m, abs=1e-9)
     assert before.height_sigma_m == pytest.approx(np.hypot(0.1, 0.01), rel=1e-6)
     assert after.height_m == before.height_m  # no sample since
-    loose = replace(
-        run, depth=replace(run.depth, variance_m2=np.full(len(run.depth), 1.0))
-    )
-    for sequence, depth_variance in ((run, 0.01**2), (loose, 1.0)):
-        (later,) = views_after(sequence, 0.1)
-        gain = 0.1**2 / (0.1**2 + depth_variance)
+    for stated_m2, variance_m2 in ((np.nan, 0.01**2), (1.0, 1.0)):
+        stated = np.full(len(run.depth), stated_m2)
+        loose = replace(run, depth=replace(run.depth, variance_m2=stated))
+        (later,) = views_after(loose, 0.1)
+        gain = 0.1**2 / (0.1**2 + variance_m2)
+        sigma_m = np.sqrt(0.1**2 * (1 - gain) + 0.01**2)
         assert later.height_m == pytest.approx(start_m - gain * 0.3, abs=1e-4)
-        assert later.height_sigma_m == pytest.approx(
-            np.sqrt(0.1**2 * (1 - gain) + 0.01**2), rel=1e-2
-        )
+        assert later.height_sigma_m == pytest.approx(sigma_m, rel=1e-2)
 
 
 @pytest.mark.parametrize("every", [1, 12])
-def test_height_follows_the_doppler_log_between_depth_samples(path, exact, every: int):
+def test_height_follows_the_doppler_log_between_depth_samples(every):
     """One sample only; the vehicle climbs by centimetres and sways by degrees, also between two frames."""
-    stamps_ns = frames_of(exact, 49)[::every]
-    _, views = along(replace(exact, depth=exact.depth.rows(slice(0, 2))), stamps_ns)
-    true = [pose.translation()[2] - FLOOR_Z_M for pose in sonar_poses(path, stamps_ns)]
+    stamps_ns = frames_of(49)[::every]
+    _, views = along(replace(EXACT, depth=EXACT.depth.rows(slice(0, 2))), stamps_ns)
+    true = [pose.translation()[2] - FLOOR_Z_M for pose in sonar_poses(stamps_ns)]
     assert np.ptp(true) > 0.02
     np.testing.assert_allclose([view.height_m for view in views], true, atol=6e-3)
     assert (np.diff([view.height_sigma_m for view in views[2:]]) > 0).all()
@@ -289,26 +251,15 @@ def test_doppler_noise_is_in_height_and_steps_gyro_noise_in_steps():
     """
     gyro = 0.004**2
     doppler = 1e-3**2 / 20
-    imu = MOUNTED.imu.model_copy(
-        update={"gyro_noise_density": 0.004, "gyro_bias_sigma": 0.0}
-    )
+    assert gyro > 300 * doppler
+    imu = MOUNTED.imu.model_copy(update={"gyro_noise_density": 0.004})
     run = at_rest(imu=imu, dvl=MOUNTED.dvl.model_copy(update={"mounting": Mounting()}))
     run = replace(run, depth=run.depth.rows(slice(0, 2)))
-    (_, step), (before, after) = along(
-        run, [run.start_ns + SECOND_NS, run.start_ns + 2 * SECOND_NS]
-    )
-    assert after.height_sigma_m**2 - before.height_sigma_m**2 == pytest.approx(
-        doppler, rel=0.1
-    )
-    assert gyro > 300 * doppler
-    R = BODY_T_SONAR.rotation().matrix()
-    lever = BODY_T_SONAR.translation()
-    skew = np.array(
-        [[0, -lever[2], lever[1]], [lever[2], 0, -lever[0]], [-lever[1], lever[0], 0]]
-    )
-    turning = np.vstack([R.T, R.T @ skew.T])
-    moving = np.vstack([np.zeros((3, 3)), R.T])
-    expected = gyro * turning @ turning.T + doppler * moving @ moving.T
-    np.testing.assert_allclose(
-        step.covariance, expected, atol=0.03 * np.abs(expected).max()
-    )
+    (_, step), views = along(run, [run.start_ns + 10**9, run.start_ns + 2 * 10**9])
+    before, after = (view.height_sigma_m**2 for view in views)
+    assert after - before == pytest.approx(doppler, rel=0.1)
+    # a turn of the body turns the sonar and moves it by its lever
+    sonar_from_body = BODY_T_SONAR.inverse().AdjointMap()
+    expected = sonar_from_body @ np.diag([gyro] * 3 + [doppler] * 3) @ sonar_from_body.T
+    atol = 0.03 * np.abs(expected).max()
+    np.testing.assert_allclose(step.covariance, expected, atol=atol)

@@ -13,7 +13,7 @@ def published() -> Sequence:
     return simulate_basin()
 
 
-def test_landmarks_are_where_the_paper_puts_them(published: Sequence):
+def test_landmarks_are_where_the_paper_puts_them(published):
     assert published.true_landmarks.ids.tolist() == [1, 2, 3, 4]
     np.testing.assert_array_equal(
         published.true_landmarks.positions[:, :2], [[5, 0], [7, -5], [2, -7], [0, -2]]
@@ -24,7 +24,7 @@ def test_landmarks_are_where_the_paper_puts_them(published: Sequence):
 
 
 def test_the_vehicle_drives_three_laps_in_the_published_time(
-    published: Sequence,
+    published,
 ):
     truth = published.truth
     assert published.duration_s == pytest.approx(2039, abs=0.2)
@@ -40,7 +40,7 @@ def test_the_vehicle_drives_three_laps_in_the_published_time(
 
 
 def test_every_landmark_is_seen_each_lap_at_the_published_distance(
-    published: Sequence,
+    published,
 ):
     ids, probability = published.detections.most_probable()
     found = published.detections.rows(probability > 0.9)

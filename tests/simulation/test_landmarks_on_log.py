@@ -33,30 +33,25 @@ def residuals(run):
     pose = run.truth.at(frames)
     place = run.true_landmarks.positions[np.searchsorted(run.true_landmarks.ids, ids)]
     seen = pose.rotations()[frame].inv().apply(place - pose.positions[frame])
-    errors = np.column_stack(
-        [
-            found.range_m - np.linalg.norm(seen, axis=1),
-            found.azimuth_rad - np.arctan2(seen[:, 1], seen[:, 0]),
-        ]
-    )
-    return errors / [
-        run.calibration.sonar.range_sigma_m,
-        run.calibration.sonar.azimuth_sigma_rad,
-    ]
+    range_m = np.linalg.norm(seen, axis=1)
+    azimuth_rad = np.arctan2(seen[:, 1], seen[:, 0])
+    errors = [found.range_m - range_m, found.azimuth_rad - azimuth_rad]
+    sonar = run.calibration.sonar
+    return np.transpose(errors) / [sonar.range_sigma_m, sonar.azimuth_sigma_rad]
+
+
+def added(**rates):
+    return add_landmarks(RECORDED, CLEAN.model_copy(update=rates))
 
 
 def test_detections_fit_the_reference_and_err_at_their_rates():
-    clean = residuals(add_landmarks(RECORDED, CLEAN))
+    clean = residuals(added())
     assert len(clean) > 100
     assert clean.std(axis=0) == pytest.approx(1.0, abs=0.15)
-    wrong = residuals(
-        add_landmarks(RECORDED, CLEAN.model_copy(update={"wrong_id_rate": 0.2}))
-    )
+    wrong = residuals(added(wrong_id_rate=0.2))
     assert 0.1 < np.mean(np.abs(wrong).max(axis=1) > 6) < 0.3
-    fewer = add_landmarks(
-        RECORDED, CLEAN.model_copy(update={"detection_probability": 0.5})
-    )
-    assert 0.4 < len(fewer.detections) / len(clean) < 0.6
+    fewer = added(detection_probability=0.5).detections
+    assert 0.4 < len(fewer) / len(clean) < 0.6
 
 
 def test_what_cannot_be_done_is_said():

@@ -3,27 +3,18 @@
 import numpy as np
 import pytest
 
-from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 
-@pytest.fixture(scope="module")
-def mission() -> Sequence:
-    return simulate_mission(
-        MissionOptions(duration_s=400, landmarks=20, false_detections_per_frame=0)
-    )
-
-
-def test_the_vehicle_goes_round_at_the_stated_speed(
-    mission: Sequence,
-):
-    positions = mission.truth.positions
+def test_the_vehicle_goes_round_at_the_stated_speed():
+    truth = simulate_mission(MissionOptions(duration_s=400)).truth
+    positions = truth.positions
     velocity = np.diff(positions, axis=0) * 50
     assert np.linalg.norm(velocity, axis=1).mean() == pytest.approx(0.5, rel=0.02)
-    forward = mission.truth.rotations()[:-1].inv().apply(velocity)
+    forward = truth.rotations()[:-1].inv().apply(velocity)
     assert np.median(forward[:, 0]) == pytest.approx(0.5, rel=0.05)
     assert np.abs(forward[:, 1:]).max() < 0.15
     assert np.hypot(*positions[:, :2].T).max() < 8
-    near_start = np.linalg.norm(positions - positions[0], axis=1) < 0.6
+    is_near = np.linalg.norm(positions - positions[0], axis=1) < 0.6
     # arrivals
-    assert np.sum(np.diff(near_start.astype(int)) == 1) == int(400 * 0.5 / 41.5)
+    assert np.sum(np.diff(is_near.astype(int)) == 1) == int(400 * 0.5 / 41.5)

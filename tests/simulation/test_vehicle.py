@@ -1,33 +1,13 @@
 """The truth is one curve: rates, accelerations and attitude must belong to the same motion."""
 
-import gtsam
 import numpy as np
 import pytest
 
 from sonar_graph.simulation.vehicle import (
-    VehiclePath,
     drive,
     follow,
     smooth_noise,
 )
-
-SECONDS = np.linspace(0, 10, 41)
-WANDER = smooth_noise(
-    SECONDS, np.array([1.0, 1.0, 1.0, 0.6, 0.6, 1.5]), 2.0, 6, np.random.default_rng(3)
-)
-PATH = VehiclePath.through(SECONDS, WANDER)
-
-
-def test_angular_velocity_integrates_to_attitude():
-    step = 1e-3
-    begin, end = (
-        gtsam.Rot3(R) for R in PATH.at(np.array([0.0, 10.0])).world_R_body.as_matrix()
-    )
-    attitude = begin
-    for omega in PATH.at(np.arange(step / 2, 10, step)).angular_velocity:
-        attitude = attitude * gtsam.Rot3.Expmap(omega * step)
-    assert np.linalg.norm(gtsam.Rot3.Logmap(attitude.between(end))) < 1e-5
-    assert np.linalg.norm(gtsam.Rot3.Logmap(begin.between(end))) > 0.1
 
 
 def test_smooth_noise_is_as_large_as_it_says_and_smooth():

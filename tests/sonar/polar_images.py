@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.images import SonarFrames
@@ -19,14 +20,8 @@ FLOOR_DB = 35.0
 
 
 def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> Floats:
-    """Down by the pitch, then rolled; written out."""
-    cp = np.cos(pitch_rad)
-    sp = np.sin(pitch_rad)
-    cr = np.cos(roll_rad)
-    sr = np.sin(roll_rad)
-    return np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array(
-        [[1, 0, 0], [0, cr, -sr], [0, sr, cr]]
-    )
+    """Down by the pitch, then rolled."""
+    return Rotation.from_euler("YX", [pitch_rad, roll_rad]).as_matrix()
 
 
 ROTATION = level_R_sonar()
@@ -85,38 +80,14 @@ def candidates_at(
 
 
 @cache
-def _floor_points(numbers: tuple[float, ...]) -> Floats:
-    rotation = np.reshape(numbers, (3, 3))
-    elevation = np.radians(np.linspace(-9, 9, 721))
-    xy = np.full((96, 512, 2), np.nan)
-    for beam, azimuth in enumerate(AZIMUTHS_RAD):
-        rays = np.column_stack(
-            [
-                np.cos(elevation) * np.cos(azimuth),
-                np.cos(elevation) * np.sin(azimuth),
-                np.sin(elevation),
-            ]
-        )
-        level = rays @ rotation.T
-        distance = np.where(
-            level[:, 2] < -1e-6, -HEIGHT_M / np.minimum(level[:, 2], -1e-6), np.inf
-        )
-        order = np.argsort(distance)
-        for axis in range(2):
-            xy[beam, :, axis] = np.interp(
-                RANGES_M,
-                distance[order],
-                (distance[:, None] * level[:, :2])[order, axis],
-                np.nan,
-                np.nan,
-            )
-    return xy
-
-
-def floor_points(rotation: Floats) -> tuple[Floats, Floats]:
-    """Level floor point (beams, bins, 2) of every pixel, by a search over elevation, and where there is one."""
-    xy = _floor_points(tuple(rotation.ravel().tolist()))
-    return xy, np.isfinite(xy[..., 0])
+def floor_of(numbers: tuple[float, ...]) -> Floats:
+    """Level floor point (beams, bins, 2) of every pixel; NaN where the sonar's 18 degrees show none."""
+    view = FloorView(np.reshape(numbers, (3, 3)), HEIGHT_M)
+    pixels = np.tile(RANGES_M, 96), np.repeat(AZIMUTHS_RAD, 512)
+    points_m = view.floor_points(*pixels)
+    is_lit = np.abs(points_m[:, 2]) < pixels[0] * np.sin(np.radians(9))
+    level_m = np.where(is_lit[:, None], points_m @ view.level_R_sonar.T, np.nan)
+    return level_m[:, :2].reshape(96, 512, 2)
 
 
 def image_db(
@@ -127,18 +98,12 @@ def image_db(
     rng: np.random.Generator | None = None,
 ) -> Floats:
     """Decibels, shape (96, 512); without a generator the mean level itself."""
-    xy, lit = floor_points(rotation)
-    level = np.where(lit, FLOOR_DB, 0.0)
+    x, y = np.moveaxis(floor_of(tuple(rotation.ravel().tolist())), 2, 0)
+    level = np.where(np.isnan(x), 0.0, FLOOR_DB)
     if design is not None:
-        u = xy[..., 0] - xy_m[0]
-        v = xy[..., 1] - xy_m[1]
-        cos = np.cos(heading_rad)
-        sin = np.sin(heading_rad)
-        on_floor = design.level_db(
-            np.nan_to_num(cos * u + sin * v, nan=9.0),
-            np.nan_to_num(cos * v - sin * u, nan=9.0),
-        )
-        level = level + np.where(lit, np.nan_to_num(on_floor), 0.0)
+        turned = np.exp(-1j * heading_rad) * (x - xy_m[0] + 1j * (y - xy_m[1]))
+        on_it = np.nan_to_num(turned, nan=9.0)
+        level += np.nan_to_num(design.level_db(on_it.real, on_it.imag))
     if rng is not None:
-        level = level + 10 * np.log10(rng.exponential(size=level.shape))
+        level += 10 * np.log10(rng.exponential(size=level.shape))
     return level.astype(np.float32)

@@ -18,37 +18,33 @@ from sonar_graph.sonar.tracker import Association
 seeds = st.integers(0, 2**32 - 1)
 
 
-def _rows(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    return rng.dirichlet(np.ones(shape[-1]), shape[:-1])
-
-
 @given(seeds)
-def test_rules_are_their_equations_with_an_index_for_everything(seed: int):
+def test_rules_are_their_equations_with_an_index_for_everything(seed):
     rng = np.random.default_rng(seed)
-    start = _rows(rng, 3, 5)
-    scores = _rows(rng, 3, 4)
-    C = _rows(rng, 5, 4)
-    birth = _rows(rng, 5)
+    before, association, C, scores = (
+        rng.dirichlet(np.ones(columns), rows)
+        for rows, columns in ((2, 5), (3, 3), (5, 4), (3, 4))
+    )
+    birth = rng.dirichlet(np.ones(5))
     sums = rng.normal(0, 30, (3, 5))
     counted = rng.uniform(0, 9, 3)
     looks = rng.uniform(1, 5)
-    doubt = rng.uniform()
-    printed = np.zeros_like(start)
-    ours = np.zeros_like(start)
+    doubt, forgetting = rng.uniform(size=2)
+    start, printed, ours = np.zeros((3, 3, 5))
     for m, k in np.ndindex(start.shape):
-        for j in range(4):
-            printed[m, k] += (
-                C[k, j]
-                * start[m, k]
-                / sum(C[i, j] * start[m, i] for i in range(5))
-                * scores[m, j]
-            )
+        carried = association[m, 2] * birth[k]
+        carried += sum(association[m, j] * before[j, k] for j in range(2))
+        start[m, k] = (1 - forgetting) * carried + forgetting * birth[k]
         ours[m, k] = birth[k] * np.exp(sums[m, k] / (counted[m] + looks))
+    for m, k, j in np.ndindex(3, 5, 4):
+        usual = sum(C[i, j] * start[m, i] for i in range(5))
+        printed[m, k] += C[k, j] * start[m, k] / usual * scores[m, j]
+    ours /= ours.sum(axis=1, keepdims=True)
+    found = predict(before, association, birth, forgetting)
+    np.testing.assert_allclose(found, start)
     np.testing.assert_allclose(jeffrey(start, scores, C), printed)
     found = bounded_evidence(birth, sums, counted, looks, doubt)
-    np.testing.assert_allclose(
-        found, (1 - doubt) * ours / ours.sum(axis=1, keepdims=True) + doubt * birth
-    )
+    np.testing.assert_allclose(found, (1 - doubt) * ours + doubt * birth)
 
 
 def test_endless_evidence_leaves_a_doubt_and_the_order_of_frames_none():
@@ -56,42 +52,18 @@ def test_endless_evidence_leaves_a_doubt_and_the_order_of_frames_none():
     sure = bounded_evidence(birth, np.array([[1e6, 0.0, 0.0]]), np.ones(1), 3.0, 0.01)
     np.testing.assert_allclose(sure, [[0.9925, 0.0025, 0.005]])
     places = [(0, 0, 0), (0, 0.2, 0), (0, 0.4, 0)]
-    other = np.array([[-1.0, 2.0, 0.0]])
-    forth, back = (
-        _after(places, odds=o)[-1]
-        for o in ([LOOKS_LIKE_1, other, other], [other, other, LOOKS_LIKE_1])
-    )
+    odds = [LOOKS_LIKE_1, *[np.array([[-1.0, 2.0, 0.0]])] * 2]
+    forth, back = (_after(places, odds=one)[-1] for one in (odds, odds[::-1]))
     assert forth == pytest.approx(back)
-
-
-@pytest.mark.parametrize(
-    ("association", "forgetting", "expected"),
-    [
-        ([[0.0, 0.0, 1.0]], 1e-3, [0.1, 0.2, 0.7]),  # new
-        (
-            [[1.0, 0.0, 0.0]],
-            0.1,
-            [0.91, 0.02, 0.07],
-        ),  # a share returns to the belief of a new track
-        ([[0.5, 0.5, 0.0]], 0.0, [0.5, 0.5, 0.0]),  # of either track before
-    ],
-)
-def test_prediction_follows_the_association(association, forgetting, expected):
-    predicted = predict(
-        np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting
-    )
-    np.testing.assert_allclose(predicted, [expected])
 
 
 def test_news_follow_from_the_autocorrelation_of_a_triangle():
     """By numerical convolution: a lens that sends and receives weighs its aperture by a triangle."""
     places = np.linspace(-0.5, 0.5, 2001)
     triangle = np.maximum(0.07 - np.abs(places), 0.0)
-    autocorrelation = np.convolve(triangle, triangle, mode="same")
+    rho = np.convolve(triangle, triangle, mode="same")
     moved = np.array([-1.0, 0.0, 0.01, 0.03, 0.0357, 0.05, 0.07, 0.09, 0.12, 0.14, 1.0])
-    expected = (
-        1 - np.interp(moved, places, autocorrelation / autocorrelation.max()) ** 2
-    )
+    expected = 1 - np.interp(moved, places, rho / rho.max()) ** 2
     np.testing.assert_allclose(independent_share(moved, 0.14), expected, atol=1e-3)
     assert expected[4] == pytest.approx(0.5, abs=0.01)
 
@@ -106,17 +78,13 @@ SIDEWAYS = np.array([[0.0, 1.0, 0.0]])
 
 
 def _association(before: list[int], after: list[int]) -> Association:
-    matrix = np.array(
-        [
-            [float(track == old) for old in before] + [float(track not in before)]
-            for track in after
-        ]
-    )
+    """Each track is itself, or new."""
+    is_same = np.equal.outer(after, before)
+    is_new = ~is_same.any(axis=1, keepdims=True)
+    matrix = np.hstack([is_same, is_new]).astype(float)
     none = np.array([], int)
-    unused = (none,) * 4
-    return Association(
-        np.array(after), *unused, 0, np.array(before, int), matrix, none, none, ()
-    )
+    ids = np.array(after), np.array(before, int)
+    return Association(ids[0], *[none] * 4, 0, ids[1], matrix, none, none, ())
 
 
 def _after(
@@ -130,12 +98,11 @@ def _after(
     beliefs = Beliefs(CONFUSION, params)
     before = []
     found = []
-    for place, log_odds in zip(
-        places, odds or [LOOKS_LIKE_1] * len(places), strict=True
-    ):
+    looked = np.array([True])
+    for k, place in enumerate(places):
         now = _association(before, [7])
-        looked = np.array([True])
-        after, _ = beliefs.step(now, log_odds, looked, np.array(place), SIDEWAYS)
+        seen = LOOKS_LIKE_1 if odds is None else odds[k]
+        after, _ = beliefs.step(now, seen, looked, np.array(place), SIDEWAYS)
         found.append(float(after[0, 0]))
         before = [7]
     return found
@@ -154,32 +121,25 @@ def test_looks_from_new_places_add_up_and_old_places_are_no_news():
     found = _after([(0, 0.07 * k, 0) for k in range(6)], unknown_prior=2 / 3)
     assert (np.diff(found) > 0).all()
     assert found[-1] > 0.9
-    away_and_back = _after([(0, 0, 0), (0, 0.1, 0), (0, 0, 0), (0, 0.1, 0)])
-    assert away_and_back[3] <= away_and_back[1] > away_and_back[0]
-    back = [(0, 0, 0), (0, 0.14, 0), (0, 0, 0)]
-    assert (
-        np.diff(_after(back, most_looks=1)) > 0
-    ).all()  # places beyond the limit are forgotten
-    remembered = _after(back)
-    assert remembered[2] <= remembered[1]
+    back = (0, 0, 0)
+    there = (0, 0.14, 0)
+    first, second, third, fourth = _after([back, there] * 2)
+    assert second > first
+    assert max(third, fourth) <= second
+    # places beyond the limit are forgotten
+    assert (np.diff(_after([back, there, back], most_looks=1)) > 0).all()
 
 
 @pytest.mark.parametrize("is_reversed", [False, True])
-def test_beliefs_follow_their_tracks(is_reversed: bool):
+def test_beliefs_follow_their_tracks(is_reversed):
     """Rows change places after the frame, or before it."""
     beliefs = Beliefs(CONFUSION)
     scores = np.array([[6.0, -3.0, 0.0], [-3.0, 6.0, 0.0]])
-    place = np.zeros(3)
-    sideways = np.tile(SIDEWAYS, (2, 1))
-    first, _ = beliefs.step(
-        _association([], [3, 4]), scores, np.array([True, True]), place, sideways
-    )
-    change = (
-        _association([4, 3], [3, 4]) if is_reversed else _association([3, 4], [4, 3])
-    )
-    after, _ = beliefs.step(
-        change, np.nan * scores, np.array([False, False]), place, sideways
-    )
+    view = np.zeros(3), np.tile(SIDEWAYS, (2, 1))
+    orders = ([4, 3], [3, 4]) if is_reversed else ([3, 4], [4, 3])
+    first, _ = beliefs.step(_association([], [3, 4]), scores, np.full(2, True), *view)
+    change = _association(*orders)
+    after, _ = beliefs.step(change, np.nan * scores, np.full(2, False), *view)
     np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)
 
 

@@ -64,7 +64,7 @@ def test_scores_are_the_posterior_of_one_look():
     ],
 )
 def test_a_file_comes_back_and_a_wrong_one_is_named_with_the_reason(
-    tmp_path: Path, change, complaint: str | None
+    tmp_path, change, complaint
 ):
     path = tmp_path / "model.json"
     written = model(designs=DESIGNS)
@@ -85,7 +85,7 @@ def test_a_file_comes_back_and_a_wrong_one_is_named_with_the_reason(
     "change",
     [{"name": "plate"}, {"size_m": 0.31}, {"height_m": 0.02}, {"mask": np.eye(4)}],
 )
-def test_designs_that_only_have_the_same_numbers_are_refused(change: dict):
+def test_designs_that_only_have_the_same_numbers_are_refused(change):
     measured = model(designs=DESIGNS)
     measured.check_designs(DESIGNS)
     with pytest.raises(

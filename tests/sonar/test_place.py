@@ -52,60 +52,37 @@ def patch_with(
     seed: int,
 ) -> Floats:
     """Levels (floor, beta, delta, gamma) of the figure at a cell of a patch of 47 by 47, with white noise."""
-    patch = np.full((47, 47), levels[0]) + np.random.default_rng(seed).normal(
-        0, noise_db, (47, 47)
-    )
-    for level, column in zip(levels[1:], columns(), strict=True):
-        patch[at[0] : at[0] + SIDE, at[1] : at[1] + SIDE] += level * column
+    floor, *others = levels
+    patch = floor + np.random.default_rng(seed).normal(0, noise_db, (47, 47))
+    x, y = at
+    patch[x : x + SIDE, y : y + SIDE] += np.tensordot(others, columns(), 1)
     return patch.astype(np.float32)
-
-
-def place_in(
-    patch: Floats, start: tuple[float, float], seen: Floats | None = None
-) -> tuple[Floats, Floats]:
-    held = np.ones_like(patch) if seen is None else seen
-    return fit_place(
-        RELIEF,
-        Patch.of(patch, held, np.zeros(2)),
-        ROWS_COLUMNS,
-        np.array(start, float),
-        Lit(SIDE_M, LONGER),
-    )
 
 
 def test_place_and_bound_are_those_of_least_squares_over_the_cells_in_view():
     """By `scipy.optimize.least_squares` on the same tangents."""
-    patch = patch_with((40, 0.7, 0.5, -9.0), (5, 6), 3.0, 2)
     x = 5
     y = 6
+    patch = patch_with((40, 0.7, 0.5, -9.0), (x, y), 3.0, 2)
     seen = np.ones((47, 47), np.float32)
     seen[:, 33:] = 0
-    place, bound = place_in(patch, (x, y), seen)
-    held = seen[x : x + SIDE, y : y + SIDE] > 0
-    z = patch[x : x + SIDE, y : y + SIDE][held].astype(float)
-    parts = columns()
-    slopes = [np.gradient(part) for part in parts]
+    start = np.array([x, y], float)
+    of = Patch.of(patch, seen, np.zeros(2)), ROWS_COLUMNS, start
+    place, bound = fit_place(RELIEF, *of, Lit(SIDE_M, LONGER))
+    inside = np.s_[x : x + SIDE, y : y + SIDE]
+    held = seen[inside] > 0
+    z = patch[inside][held].astype(float)
+    parts = np.array(columns())
+    slopes = np.gradient(parts, axis=(1, 2))
 
     def residuals(q: Floats) -> Floats:
-        floor, *levels, dx, dy = q
-        shifted = [
-            c - dx * s[0] - dy * s[1] for c, s in zip(parts, slopes, strict=True)
-        ]
-        return (
-            z
-            - floor
-            - sum(level * part for level, part in zip(levels, shifted, strict=True))[
-                held
-            ]
-        )
+        shifted = parts - q[4] * slopes[0] - q[5] * slopes[1]
+        return z - q[0] - np.tensordot(q[1:4], shifted, 1)[held]
 
     found = least_squares(residuals, [40, 1, 0.3, -5, 0, 0])
-    np.testing.assert_allclose(place - (x, y), found.x[4:], atol=0.02)
-    mean_square = np.mean(found.fun**2)
-    expected = np.sqrt(
-        mean_square * np.diag(np.linalg.inv(found.jac.T @ found.jac))[4:]
-    )
-    np.testing.assert_allclose(bound, expected, rtol=0.03)
+    np.testing.assert_allclose(place - start, found.x[4:], atol=0.02)
+    covariance = np.mean(found.fun**2) * np.linalg.inv(found.jac.T @ found.jac)
+    np.testing.assert_allclose(bound, np.sqrt(np.diag(covariance)[4:]), rtol=0.03)
 
 
 AN_L = (0.0, -0.12, 0.17, 0.05), (-0.12, 0.05, 0.05, 0.12)
@@ -118,38 +95,28 @@ def test_a_landmark_is_where_the_middle_of_its_square_is():
     sonar_m = np.array([0, 0, 0.95])
     tilt = Rotation.from_euler("Y", 0.52)
     model = confusion_for([design]).model_copy(update={"height_bias_m": 0.0})
+    look = CandidateFit([design], AppearanceParams(), model, np.radians(14))
+    view = FloorView(tilt.as_matrix(), 0.95 - design.height_m)
     errors = []
     figure = np.array(design.figure_m)
     np.testing.assert_allclose(figure - middle_m, (-0.0497, -0.0497), atol=2e-3)
+    near_m = np.array([1.75, 0.02, design.height_m])
     for seed, heading in enumerate((0.4, 2.1, 4.4)):
-        turn = np.array(
-            [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
-        )
-        centre_m = np.array([*((1.75, 0.02) - turn @ figure), design.height_m])
-        simulator = FrameSimulator(
-            ImageOptions(), [place_landmark(design, centre_m, heading, 0.0)], 0.0, seed
-        )
+        turn = Rotation.from_euler("Z", heading)
+        centre_m = near_m - turn.apply([*figure, 0.0])
+        placed = place_landmark(design, centre_m, heading, 0.0)
+        simulator = FrameSimulator(ImageOptions(), [placed], 0.0, seed)
         level_db = simulator.level_db(sonar_m, tilt, 0, 1.75)
-        frame = SonarFrames(
-            np.array([1]),
-            level_db[None],
-            simulator.ranges_m(),
-            simulator.azimuths_rad(),
-        )
-        places = tilt.inv().apply(
-            np.array([centre_m, [1.75, 0.02, design.height_m]]) - sonar_m
-        )
+        axes = simulator.ranges_m(), simulator.azimuths_rad()
+        frame = SonarFrames(np.array([1]), level_db[None], *axes)
+        places = tilt.inv().apply(np.array([centre_m, near_m]) - sonar_m)
         r, near_r = np.linalg.norm(places, axis=1)
         a, near_a = np.arctan2(places[:, 1], places[:, 0])
-        look = CandidateFit([design], AppearanceParams(), model, np.radians(14))
-        view = FloorView(tilt.as_matrix(), 0.95 - design.height_m)
-        (seen,) = look.at(
-            level_db, frame, view, candidates_at([near_r], [near_a]), np.array([0])
-        )
+        candidates = candidates_at([near_r], [near_a])
+        (seen,) = look.at(level_db, frame, view, candidates, np.array([0]))
         assert seen.moved_m.max() > 0.001  # an error of the heading
-        errors.append(
-            (seen.range_m - r, seen.azimuth_rad - a) / np.sqrt(np.diag(seen.covariance))
-        )
+        off = np.array([seen.range_m - r, seen.azimuth_rad - a])
+        errors.append(off / np.sqrt(np.diag(seen.covariance)))
     assert np.mean(np.square(errors)) < 2
     assert np.abs(errors).max() < 4
 
@@ -167,7 +134,7 @@ def test_a_figure_beside_the_middle_that_looks_the_same_turned_is_refused():
 
 @pytest.mark.parametrize("slope", [0.15, 0.6, 1.2])
 @pytest.mark.parametrize("design", [0, 2])
-def test_side_and_shadow_of_a_place_are_those_of_the_slope(slope: float, design: int):
+def test_side_and_shadow_of_a_place_are_those_of_the_slope(slope, design):
     """``t h / d`` of the face and ``t (d / h + h / d)`` behind it of 12 mm of foam: nothing is left, the bound is 0.
 
     In the same appearance after each other, so that what was drawn for one slope is not taken for another.
@@ -178,33 +145,31 @@ def test_side_and_shadow_of_a_place_are_those_of_the_slope(slope: float, design:
     row = len(appearance.templates.heading_rad) // 3
     heading_rad = float(appearance.templates.heading_rad[row])
     side = appearance.templates.side
-    cell_m = CELL_M
+    grid = Grid(side, CELL_M, BLUR_M)
+    centre_m = np.array([2.0, 0.1])
+    moved = np.array([1, -2])
+    at = centre_m + CELL_M * moved
+    fit = DesignFit(
+        np.zeros((1, 11)),
+        1.0,
+        np.array([heading_rad]),
+        at[None] + 0.004,
+        np.array([row]),
+        np.array([-1]),
+    )
     for other in (0.9, slope):
-        length = relief_m * (other + 1 / other) / (cell_m / 2)
+        length = relief_m * (other + 1 / other) / (CELL_M / 2)
         steps = int(length)
-        drawn_now = Relief.of(tall, heading_rad, Grid(side, cell_m, BLUR_M), steps)
-        a_step = drawn_now.longer - drawn_now.shorter
-        shade = drawn_now.shorter + (length - steps) * a_step
-        face = drawn_now.figure + relief_m * other * drawn_now.side
+        drawn = Relief.of(tall, heading_rad, grid, steps)
+        shade = drawn.shorter + (length - steps) * (drawn.longer - drawn.shorter)
+        face = drawn.figure + relief_m * other * drawn.side
         level = np.full((appearance.patch_side, appearance.patch_side), 40.0)
-        inset = (appearance.patch_side - side) // 2 + np.array([1, -2])
+        inset = (appearance.patch_side - side) // 2 + moved
         inside = tuple(slice(first, first + side) for first in inset)
-        level[inside] += 0.7 * face + 0.5 * drawn_now.dark * (1 - shade) - 9.0 * shade
-        seen = np.ones_like(level, dtype=np.float32)
-        centre_m = np.array([2.0, 0.1])
-        patch = Patch(
-            level.astype(np.float32), seen, level.astype(np.float32), seen, centre_m
-        )
-        at = centre_m + cell_m * np.array([1, -2])
-        whole = np.array([-1])
-        fit = DesignFit(
-            np.zeros((1, 11)),
-            1.0,
-            np.array([heading_rad]),
-            at[None] + 0.004,
-            np.array([row]),
-            whole,
-        )
+        level[inside] += 0.7 * face + 0.5 * drawn.dark * (1 - shade) - 9.0 * shade
+        level = level.astype(np.float32)
+        seen = np.ones_like(level)
+        patch = Patch(level, seen, level, seen, centre_m)
         place_m, bound_m, _ = appearance.place(patch, fit, 0, other)
         np.testing.assert_allclose(place_m, at, atol=2e-5)
         assert (bound_m < 2e-5).all()

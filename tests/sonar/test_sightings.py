@@ -64,16 +64,11 @@ def test_range_and_azimuth_are_those_of_the_fitted_centre(triangle):
     found = look_at(triangle, (1.725, 0.03))
     r, a = polar((1.7, 0.05))
     assert odds(found.fit).argmax() == TRIANGLE
-    assert (found.range_m, found.azimuth_rad) == (
-        pytest.approx(r, abs=0.006),
-        pytest.approx(a, abs=0.004),
-    )
-    sigmas_m = np.hypot(
-        np.array([0.01, 0.008]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5, found.moved_m
-    )
-    np.testing.assert_allclose(
-        found.covariance, np.diag((sigmas_m / [1, found.range_m]) ** 2)
-    )
+    assert found.range_m == pytest.approx(r, abs=0.006)
+    assert found.azimuth_rad == pytest.approx(a, abs=0.004)
+    usual_m = np.array([0.01, 0.008]) * (found.bound_m / [1e-3, 1.2e-3]) ** 1.5
+    sigmas = np.hypot(usual_m, found.moved_m) / [1, found.range_m]
+    np.testing.assert_allclose(found.covariance, np.diag(sigmas**2))
 
 
 def test_a_fit_tells_no_less_than_the_centroid_of_its_candidate(triangle):
@@ -83,68 +78,47 @@ def test_a_fit_tells_no_less_than_the_centroid_of_its_candidate(triangle):
     np.testing.assert_allclose(found.covariance, np.diag(np.square(sigmas)))
 
 
-def test_the_height_of_a_face_is_added_to_the_range(
-    triangle,
-):
+def test_the_height_of_a_face_is_added_to_the_range(triangle):
     high = MODEL.model_copy(update={"height_bias_m": 0.02})
     plain, found = (look_at(triangle, (1.7, 0.05), model) for model in (MODEL, high))
-    assert found.range_m - plain.range_m == pytest.approx(
-        0.02 * HEIGHT_M / plain.range_m, rel=1e-6
-    )
+    longer_m = 0.02 * HEIGHT_M / plain.range_m
+    assert found.range_m - plain.range_m == pytest.approx(longer_m, rel=1e-6)
     assert look_at(triangle, (1.7, 0.05), high, view=None).range_per_height == 0.0
 
 
 @pytest.mark.parametrize(
-    ("near_m", "view", "aperture_rad"),
+    ("near_m", "changes"),
     [
-        ((1.7, 0.75), VIEW, APERTURE_RAD),  # hardly in the image
-        (
-            (0.9, 0.0),
-            FloorView(ROTATION, 2.0),
-            APERTURE_RAD,
-        ),  # no ray meets the floor there
-        (
-            (1.95, 0.05),
-            VIEW,
-            0.05,
-        ),  # a fan of a fifth of the opening shows a strip of it
+        ((1.7, 0.75), {}),  # hardly in the image
+        ((0.9, 0.0), {"view": FloorView(ROTATION, 2.0)}),  # no ray meets the floor
+        # a fan of a fifth of the opening shows a strip of it
+        ((1.95, 0.05), {"aperture_rad": 0.05}),
     ],
 )
-def test_what_is_not_in_view_is_compared_with_nothing(
-    triangle, near_m, view, aperture_rad
-):
-    found = look_at(triangle, near_m, view=view, aperture_rad=aperture_rad)
+def test_what_is_not_in_view_is_compared_with_nothing(triangle, near_m, changes):
+    found = look_at(triangle, near_m, **changes)
     assert found.fit is None
     r, a = polar(near_m)
     assert (found.range_m, found.azimuth_rad) == (r, a)
-    np.testing.assert_allclose(
-        found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2])
-    )
+    sigmas = CENTROID_SIGMA_M, CENTROID_SIGMA_M / r
+    np.testing.assert_allclose(found.covariance, np.diag(np.square(sigmas)))
 
 
 def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image():
     """A design drawn in that plane is found; on the floor's grid it would be foreshortened."""
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
-    level = (
-        np.nan_to_num(
-            DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)
-        )
-        + 35.0
-    )
-    image = (
-        level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))
-    ).astype(np.float32)
-    r = np.hypot(1.9, 0.1)
-    a = np.arctan2(0.1, 1.9)
-    candidate = candidates_at([r], [a])
+    figure = DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)
+    power = np.random.default_rng(3).exponential(size=r.shape)
+    level = 35.0 + np.nan_to_num(figure) + 10 * np.log10(power)
+    image = level.astype(np.float32)
+    place = np.hypot(1.9, 0.1), np.arctan2(0.1, 1.9)
+    candidate = candidates_at(*np.transpose([place]))
     look = CandidateFit(FLUSH, AppearanceParams(), MODEL, APERTURE_RAD)
     flat, tilted = (
         look.at(image, frame(image), view, candidate, np.array([0]))[0]
         for view in (None, VIEW)
     )
     assert odds(flat.fit).argmax() == 1
-    assert (flat.range_m, flat.azimuth_rad) == (
-        pytest.approx(r, abs=0.006),
-        pytest.approx(a, abs=0.003),
-    )
+    off = np.subtract((flat.range_m, flat.azimuth_rad), place)
+    assert (np.abs(off) < [0.006, 0.003]).all()
     assert tilted.fit is None or odds(tilted.fit)[1] < odds(flat.fit)[1] - 1

@@ -19,10 +19,7 @@ from .polar_images import WINDOW, candidates_at
 
 FRAME_NS = 100_000_000
 STILL = SonarStep.none()
-AREA = float(np.prod(WINDOW[:, 1] - WINDOW[:, 0]))
-_mixing = np.random.default_rng(11).normal(size=(6, 6)) * 0.02
-CORRELATED = _mixing @ _mixing.T
-"""Covariance of a step whose rotation and translation are wrong together."""
+NOTHING = candidates_at([], [])
 
 
 def moved_by(x=0.0, y=0.0, yaw=0.0):
@@ -30,15 +27,11 @@ def moved_by(x=0.0, y=0.0, yaw=0.0):
     return SonarStep(pose, np.diag([1e-8] * 3 + [1e-6] * 3))
 
 
-def run(tracker, frames, step=STILL):
-    """Associations of frames, each a list of (range, azimuth)."""
+def run(tracker, frames):
+    """Associations of frames from one place, each an array of (range, azimuth)."""
     return [
-        tracker.step(
-            candidates_at([r for r, _ in seen], [a for _, a in seen]),
-            step,
-            (k + 1) * FRAME_NS,
-        )
-        for k, seen in enumerate(frames)
+        tracker.step(candidates_at(*np.reshape(seen, (-1, 2)).T), STILL, k * FRAME_NS)
+        for k, seen in enumerate(frames, 1)
     ]
 
 
@@ -56,30 +49,30 @@ def track_at(q, P) -> TrackStates:
 def test_the_association_is_a_distribution_whatever_the_order(counts, seed, is_crowded):
     """Places are drawn and not chosen: between two candidates equally far from a track there is no better one."""
     rng = np.random.default_rng(seed)
-    r, a = ((1.8, 2.0), 0.06) if is_crowded else ((1.3, 2.5), 0.24)
-    frames = [
-        list(zip(rng.uniform(*r, n), rng.uniform(-a, a, n), strict=True))
-        for n in counts
-    ]
-    shuffled = [[seen[i] for i in rng.permutation(len(seen))] for seen in frames]
-    pairs = list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True))
+    low, high = (
+        ((1.8, -0.06), (2.0, 0.06)) if is_crowded else ((1.3, -0.24), (2.5, 0.24))
+    )
+    frames = [rng.uniform(low, high, (n, 2)) for n in counts]
+    associations = run(Tracker(), frames)
     numbers = []
-    for found, _ in pairs:
+    for found in associations:
         assert found.matrix.shape == (len(found.ids), len(found.previous_ids) + 1)
         assert (found.matrix >= 0).all()
         assert np.allclose(found.matrix.sum(axis=1), 1.0)
         assert ((found.existence >= 0) & (found.existence <= 1)).all()
-        goes_on = np.isin(found.ids, found.previous_ids)
-        assert (
-            found.matrix[goes_on, -1] == 0
-        ).all()  # only a track that starts can be new
-        assert (found.matrix[~goes_on, -1] > 0).all()
-        numbers += found.ids[~goes_on].tolist()
-        assert len(set(numbers)) == len(numbers)  # numbers are not used twice
+        is_new = ~np.isin(found.ids, found.previous_ids)
+        # only a track that starts can be new
+        np.testing.assert_array_equal(found.matrix[:, -1] > 0, is_new)
+        numbers += found.ids[is_new].tolist()
         taken = found.candidate[found.candidate >= 0]
         assert len(np.unique(taken)) == len(taken)  # one candidate serves one track
+    assert len(set(numbers)) == len(numbers)  # numbers are not used twice
+    shuffled = run(Tracker(), [rng.permutation(seen) for seen in frames])
     for name in ("position_m", "existence"):
-        one, other = (np.sort(getattr(found, name), axis=0) for found in pairs[-1])
+        one, other = (
+            np.sort(getattr(each[-1], name), axis=0)
+            for each in (associations, shuffled)
+        )
         assert np.allclose(one, other)
 
 
@@ -89,24 +82,23 @@ def test_association_and_existence_are_ratios_of_densities_by_hand():
     Then one track, and one candidate 2 cm behind it.
     """
     params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
-    found = run(Tracker(params), [[(2.0, 0.0), (2.0, 0.03)]] * 2)[-1]
+    area = np.prod(np.diff(WINDOW))
     # A track starts with the noise of one candidate, and the next one adds its own: twice the variance.
     var_r = 2 * params.range_sigma_m**2
     var_a = 2 * params.azimuth_sigma_rad**2
-    own = 0.1 / 0.6 * 0.9 / (2 * np.pi * np.sqrt(var_r * var_a))
-    other = own * np.exp(-0.5 * 0.03**2 / var_a)
-    none = 0.6 / AREA
-    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]]) / (
-        own + other + none
-    )
-    assert found.matrix == pytest.approx(expected, rel=1e-6)
-    found = run(Tracker(params), [[(2.0, 0.0)], [(2.02, 0.0)]])[-1]
-    density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
+    peak = 1 / (2 * np.pi * np.sqrt(var_r * var_a))
     birth = 0.1 / 0.6
-    likelihood = 0.1 + 0.9 * density * AREA / 0.5
-    assert found.existence[0] == pytest.approx(
-        birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6
-    )
+    own = birth * 0.9 * peak
+    other = own * np.exp(-0.5 * 0.03**2 / var_a)
+    none = 0.6 / area
+    found = run(Tracker(params), [[(2.0, 0.0), (2.0, 0.03)]] * 2)[-1]
+    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]])
+    assert found.matrix == pytest.approx(expected / (own + other + none), rel=1e-6)
+    found = run(Tracker(params), [[(2.0, 0.0)], [(2.02, 0.0)]])[-1]
+    density = peak * np.exp(-0.5 * 0.02**2 / var_r)
+    exists = birth * (0.1 + 0.9 * density * area / 0.5)
+    expected = exists / (1 - birth + exists)
+    assert found.existence[0] == pytest.approx(expected, rel=1e-6)
     # between two equally certain places
     assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
 
@@ -121,20 +113,20 @@ def test_a_missed_track_loses_existence_as_bayes_says(
 ):
     tracker = Tracker(TrackingParams(lifetime_s=lifetime_s, least_existence=0.0))
     before = run(tracker, [[(range_m, 0.0)]] * frames)[-1].existence[0]
-    found = tracker.step(
-        candidates_at([], []), STILL, frames * FRAME_NS + round(elapsed_s * 1e9)
-    )
+    stamp_ns = frames * FRAME_NS + round(elapsed_s * 1e9)
+    found = tracker.step(NOTHING, STILL, stamp_ns)
     faded = before * np.exp(-elapsed_s / lifetime_s)
-    assert found.existence[0] == pytest.approx(
-        faded * missed / (1 - faded + faded * missed), rel=1e-4
-    )
+    expected = faded * missed / (1 - faded + faded * missed)
+    assert found.existence[0] == pytest.approx(expected, rel=1e-4)
     assert (found.matrix.tolist(), found.candidate.tolist()) == ([[1.0, 0.0]], [-1])
     assert found.frames_seen.tolist() == [frames]
 
 
 def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
+    """The rotation and the translation of the step are wrong together."""
     rng = np.random.default_rng(9)
-    step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
+    mixing = 0.02 * rng.normal(size=(6, 6))
+    step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, mixing @ mixing.T)
     q = np.array([2.0, 0.3, -0.2])
     P = np.diag([1e-3, 2e-3, 4e-3])
     found, rested = (track_at(q, P).moved(motion, 0.02) for motion in (step, STILL))
@@ -145,11 +137,12 @@ def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
         for n, p in zip(noise, points, strict=True)
     ]
     assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=1e-2)
-    expected = np.cov(np.array(sampled).T) + 0.02**2 * np.eye(3)
+    drift = 0.02**2 * np.eye(3)
+    atol = 0.06 * found.position_cov.max()
     assert np.allclose(
-        found.position_cov[0], expected, atol=0.06 * found.position_cov.max()
+        found.position_cov[0], np.cov(np.transpose(sampled)) + drift, atol=atol
     )
-    assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
+    assert rested.position_cov[0] == pytest.approx(P + drift)
 
 
 def test_a_correction_is_that_of_the_information_form():
@@ -157,19 +150,19 @@ def test_a_correction_is_that_of_the_information_form():
     q = np.array([1.9, 0.2, -0.3])
     P = np.diag([1e-2, 3e-2, 2e-2])
     R = np.diag([9e-4, 2e-4])
+    off = np.array([0.02, -0.01])
     tracks = track_at(q, P)
-    expected = Expected.of(tracks, R)
 
     def seen(point):
         return np.array([np.linalg.norm(point), np.arctan2(point[1], point[0])])
 
     H = np.column_stack([(seen(q + d) - seen(q - d)) / 2e-6 for d in 1e-6 * np.eye(3)])
-    z = seen(q) + np.array([0.02, -0.01])
-    after = corrected(tracks, expected, z[None], np.array([0]), R)
+    z = np.array([seen(q) + off])
+    after = corrected(tracks, Expected.of(tracks, R), z, np.array([0]), R)
     information = np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H
     assert np.allclose(after.position_cov[0], np.linalg.inv(information), rtol=1e-5)
-    gain = np.linalg.solve(information, H.T @ np.linalg.inv(R))
-    assert after.position_m[0] == pytest.approx(q + gain @ [0.02, -0.01], abs=1e-7)
+    moved = np.linalg.solve(information, H.T @ np.linalg.solve(R, off))
+    assert after.position_m[0] == pytest.approx(q + moved, abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +173,7 @@ def test_what_leaves_the_image_ends_and_is_not_held_against_it(inside_m, ahead):
     start_m = WINDOW[0, 0 if inside_m > 0 else 1] + inside_m
     before = run(tracker, [[(start_m, 0.0)]] * 10)[-1]
     tracker.skip(moved_by(0.2 * ahead))
-    out = tracker.step(candidates_at([], []), moved_by(0.0), 20 * FRAME_NS)
+    out = tracker.step(NOTHING, STILL, 20 * FRAME_NS)
     assert out.ended_ids.tolist() == before.ids.tolist() or out.existence[0] > 0.99
-    gone = tracker.step(candidates_at([], []), moved_by(0.3 * ahead), 21 * FRAME_NS)
+    gone = tracker.step(NOTHING, moved_by(0.3 * ahead), 21 * FRAME_NS)
     assert "left the image" in out.ended_reasons + gone.ended_reasons
