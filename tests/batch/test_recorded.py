@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -23,7 +22,7 @@ from sonar_graph.batch.result_table import (
 )
 from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.errors import EvaluationError
-from tests.recorded_batches import LOGS, drawn_batch, with_failures, write_batch
+from tests.recorded_batches import LOGS, drawn_batch, write_batch
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
@@ -57,17 +56,6 @@ def test_pairs_have_the_same_log_and_seed():
     # a score that the reference never has is no failure
     assert batch.is_asked(LOGS[0], "isam2", MAP)
     assert len(batch.pairs(LOGS[0], "isam2", MAP)[0]) == 0
-
-
-def test_a_run_that_did_not_end_is_a_row_without_values():
-    batch = drawn_batch(6)
-    for count in (1, 6):
-        for log in LOGS:
-            batch = with_failures(batch, "isam2", log, count)
-        own, reference = batch.pairs(LOGS[0], "isam2", ATE)
-        assert np.isinf(own).tolist() == [True] * count + [False] * (6 - count)
-        assert np.isfinite(reference).all()
-    assert not batch.is_asked(LOGS[0], "isam2", "depth_m"), "nobody has it"
 
 
 def test_what_is_no_batch_is_refused_with_the_file_at_fault(tmp_path):

@@ -15,7 +15,7 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.report import sentences
 from sonar_graph.report.figures.maps import true_landmarks_drawn
 from sonar_graph.report.landmark_table import landmark_table
-from sonar_graph.states import Estimate, LandmarkMap, Trajectory
+from sonar_graph.states import Estimate, LandmarkMap
 from sonar_graph.testing import small_world
 
 from .conftest import Offset, straight_sequence
@@ -81,28 +81,6 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
     assert scores["smoothed.ate_raw_m"].protocol.startswith("Smoothed")
 
 
-def test_truth_with_positions_only_scores_positions_alone(install):
-    """Nothing that needs a true orientation is scored, drawn or summed up; what is scored has the same value."""
-    whole = straight_sequence()
-    truth = whole.truth
-    climb = np.outer(np.linspace(0.0, 1e-3, len(truth)), [0, 0, 1])
-    truth = replace(truth, positions=truth.positions + climb)
-    positions = Trajectory.of_positions(truth.stamps_ns, truth.positions)
-    settings = {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}
-    full, partial = (
-        compare(replace(whole, truth=known), ["offset"], settings)
-        for known in (truth, positions)
-    )
-    all_scores, scores = (one.scores["offset"] for one in (full, partial))
-    lacking = {key.partition(".")[2] for key in all_scores.keys() - scores}
-    needed = {"yaw_rmse_rad", "nees_yaw", "rpe_10s_m", "rpe_10s_rad"}
-    assert needed <= lacking <= needed | {"peak_mb"}
-    for key, score in scores.items():
-        if not key.startswith(("time", "memory")):
-            assert score.value == all_scores[key].value, key
-    assert np.isnan(partial.errors["offset"]["causal"].yaw_rad).all()
-
-
 def test_all_are_scored_at_the_instants_that_all_have(install):
     begin_ns = 4_000_000_000
 
@@ -120,27 +98,20 @@ def test_all_are_scored_at_the_instants_that_all_have(install):
     assert len(comparison.runs[0].causal or ()) == 40
 
 
-def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
-    together = compare(straight_sequence(), ["broken", "offset"])
-    alone = compare(straight_sequence(), ["offset"])
-    assert [run.status for run in together.runs] == ["failed", "ok"]
-    assert together.scores["broken"] == together.errors["broken"] == {}
-    assert together.scores["offset"][KEY] == alone.scores["offset"][KEY]
-
-
 def test_without_enough_truth_the_rest_is_scored(install):
-    comparison = compare(straight_sequence(truth=False), ["offset"])
-    keys = set(comparison.scores["offset"])
-    assert not any(key.startswith(("causal.", "smoothed.")) for key in keys)
-    assert {"landmarks.count", "detections.used", "time.total_s"} <= keys
-    assert "landmarks.raw_m" not in keys
-    assert comparison.errors == {}
-    assert "no truth" in comparison.environment["scored instants"]
+    """One instant is too little."""
     sequence = straight_sequence()
     short = replace(sequence, truth=sequence.truth.rows(slice(0, 7)))
-    comparison = compare(short, ["offset"])
-    assert comparison.errors == {}, "one instant is too little"
-    assert comparison.environment["scored instants"].startswith("1 of 40 instants")
+    for given, told in (
+        (straight_sequence(truth=False), "none: the log has no truth"),
+        (short, "1 of 40 instants"),
+    ):
+        comparison = compare(given, ["offset"])
+        keys = set(comparison.scores["offset"])
+        assert not any(key.startswith(("causal.", "smoothed.")) for key in keys)
+        assert {"landmarks.count", "detections.used", "time.total_s"} <= keys
+        assert comparison.errors == {}
+        assert comparison.environment["scored instants"].startswith(told)
 
 
 @pytest.mark.parametrize(

@@ -146,17 +146,6 @@ def landmark_map(ids: list[int], positions: object) -> LandmarkMap:
     return LandmarkMap(np.array(ids, dtype=np.int64), places, covs)
 
 
-def test_landmarks_are_matched_by_identity_not_by_row():
-    true = landmark_map([6, 8, 20], [[0, 0, 0], [1, 0, 0], [0, 5, 0]])
-    estimated = landmark_map([8, 20, 30], [[1, 0.5, 0], [0, 5, 0], [7, 7, 7]])
-    errors = metrics.landmark_errors(estimated, true)
-    np.testing.assert_array_equal(errors.ids, [8, 20])
-    np.testing.assert_allclose(errors.horizontal_m, [[0, 0.5], [0, 0]])
-    one = landmark_map([1], [[0, 0, 0]])
-    # one landmark cannot be aligned
-    assert np.isnan(metrics.landmark_errors(one, one).aligned_rmse_m)
-
-
 FARTHEST_M = 1.0
 
 

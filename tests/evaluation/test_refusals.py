@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
 from sonar_graph.evaluation import (
@@ -17,7 +15,6 @@ from sonar_graph.evaluation import (
     gathered,
     run_estimator,
 )
-from sonar_graph.logs import read_log, write_log
 from sonar_graph.measurements import Heading, Measurements, PositionFixes
 from sonar_graph.navigation import Odometry
 from sonar_graph.sequence import Sequence
@@ -33,23 +30,21 @@ NS = 10**9
 
 
 def test_few_rows_are_named_each_and_many_are_counted_by_sensor_and_reason():
-    def told(*rows: RefusedRow) -> list[tuple[int, int, int, str]]:
+    def told(*rows: RefusedRow) -> list[tuple[str, int, str, str]]:
         found = gathered(rows)
-        return [
-            (one.count, one.first_ns, one.last_ns, one.distances()) for one in found
-        ]
+        return [(r.sensor, r.count, r.times(-NS), r.distances()) for r in found]
 
-    n = MOST_ROWS_NAMED
-    few = [outlier(k, 50.0 + k) for k in range(n)]
-    assert told(*few[::-1]) == [(1, k, k, f"{50 + k}") for k in range(n)]
-    many = outlier(99, 7.5), *few
-    assert told(*many) == [(n + 1, 0, 99, "7.50 to 54")]
-    assert gathered(many)[0].times(-NS) == "1.000 to 1.000"
+    few = [outlier(k, 50.0 + k) for k in range(MOST_ROWS_NAMED)]
+    each = [("dvl", 1, "1.000", f"{row.distance:.0f}") for row in few]
+    assert told(*few[::-1]) == each
     # rows that differ in their time alone are one line
-    assert told(late(0), late(7)) == [(2, 0, 7, "")]
-    mixed = [late(k) for k in range(9)] + [RefusedRow("dvl", 3, Refusal.LATE, math.nan)]
-    found = {(rows.sensor, rows.count) for rows in gathered([*many, *mixed])}
-    assert found == {("dvl", n + 1), ("imu", 9), ("dvl", 1)}
+    waited = ("imu", 2, "1.000 to 2.000", "")
+    assert told(late(0), outlier(99, 7.5), *few, late(NS)) == [
+        ("dvl", MOST_ROWS_NAMED + 1, "1.000 to 1.000", "7.50 to 54"),
+        waited,
+    ]
+    both = RefusedRow("dvl", 3, Refusal.LATE, math.nan), *few
+    assert len(told(*both)) == MOST_ROWS_NAMED + 1
 
 
 @pytest.fixture(scope="module")
@@ -246,8 +241,6 @@ def test_late_rows_are_named_and_not_used(straight, name):
     expected += [("imu", at_ns, Refusal.LATE) for at_ns in imu.stamps_ns.tolist()]
     assert sorted(row[:3] for row in refused) == expected
     assert estimate.world_T_body.equals(other.world_T_body, 1e-9)
-
-
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

@@ -1,6 +1,5 @@
 """Laws of both pages, of a comparison and of a batch: whole, self-contained, escaped, readable; and the front door."""
 
-import doctest
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -12,11 +11,8 @@ import pytest
 from sonar_graph import table
 from sonar_graph.evaluation import (
     Score,
-    digits,
-    read_comparison,
     score_table,
 )
-from sonar_graph.report import comparison_page
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.figure_style import ESTIMATOR_COLOURS
@@ -90,15 +86,6 @@ def test_what_a_log_or_an_estimator_says_is_escaped_everywhere():
         Page("<div><p>text</div>")  # the check of tags can fail
 
 
-def test_a_notebook_shows_every_score_under_its_run():
-    compared = basin_comparison(60)
-    text = Page(compared._repr_html_()).text
-    every = score_table(compared)
-    assert all(cell.text in text for row in every.rows for cell in row)
-    names = [column.heading for column in every.columns[2:-1]]
-    assert names == [run.estimator for run in compared.runs]
-
-
 def test_a_notebook_shows_sequences_paths_and_maps():
     """Whole tables, of a part of a large map, and nothing that a name could run."""
     compared = basin_comparison(60)
@@ -108,7 +95,9 @@ def test_a_notebook_shows_sequences_paths_and_maps():
     many = LandmarkMap(np.arange(50), np.zeros((50, 3)), np.tile(np.eye(3), (50, 1, 1)))
     assert "<script" not in sequence._repr_html_()
     rows = "imu 2 0.00", "detections 60", "truth 60", "true landmarks 4"
+    scores = [cell.text for row in score_table(compared).rows for cell in row]
     for shown, words in (
+        (compared, scores),
         (sequence, (HOSTILE, *rows)),
         (path, (f"length of the path {length_m:.2f} m", "covariances known")),
         (sequence.truth, ("covariances unknown",)),
@@ -200,21 +189,3 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
     texts = dict.fromkeys(("--muted", "--link", "--warning"), 4.5)
     for name, least in (texts | dict.fromkeys(runs, 3) | {"--ink": 7}).items():
         assert contrast(colours[name], colours["--paper"]) >= least, name
-
-
-def test_examples_of_digits_run():
-    done = doctest.testmod(digits)
-    assert done.attempted > 0
-    assert done.failed == 0
-
-
-@pytest.mark.usefixtures("unrendered")
-def test_a_report_is_written_with_all_files_of_its_comparison(tmp_path):
-    compared = basin_comparison(60)
-    folder = tmp_path / "new"
-    page = comparison_page.write_report(compared, str(folder))
-    assert page == folder / "report.html"
-    results = {f"result.{kind}" for kind in ("mcap", "foxglove.json", "rviz")}
-    names = "report.html comparison.json sequence.npz runs .sonar_graph.json .lock"
-    assert {path.name for path in folder.iterdir()} == results | set(names.split())
-    assert list(read_comparison(folder).scores) == list(compared.scores)
