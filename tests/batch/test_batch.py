@@ -97,7 +97,7 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
     assert len({row["causal.ate_raw_m"] for row in undisturbed}) == 4
     begun: set[str] = set()
 
-    def interrupted(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
+    def interrupted(runs, store, *_others):
         do_here(runs[:1], store)
         begun.add(runs[0].key)
         raise KeyboardInterrupt
@@ -120,16 +120,16 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
 ):
     folder = tmp_path / "out"
 
-    def no_space(*_arguments: Any) -> None:
+    def no_space(*_arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     class Full(Store):
-        def write(self, key: str, outcome: RunOutcome) -> None:
+        def write(self, key, outcome):
             if len(list((self.folder / "runs").iterdir())) == 2:
                 no_space()
             super().write(key, outcome)
 
-    def kept(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
+    def kept(runs, store, *_others):
         for run in runs:
             future: Future[RunOutcome] = Future()
             future.set_result(done(run))
@@ -171,11 +171,11 @@ def test_a_changed_suite_resumes_in_its_folder(
 ):
     folder = tmp_path / "out"
 
-    def refused(told: str) -> None:
+    def refused(told):
         with pytest.raises(BatchError, match=told), opened(suite, folder):
             pass
 
-    def contents() -> list[bytes]:
+    def contents():
         return [(folder / name).read_bytes() for name in ("suite.toml", RESULTS)]
 
     text = suite.read_text()
@@ -221,7 +221,7 @@ def kill(
 ) -> None:
     """Some runs are done and reported, and then the process is gone."""
 
-    def killed(runs: list[PlannedRun], store: Store, *others: Any) -> None:
+    def killed(runs, store, *others):
         for run in runs[:count]:
             do_here([run], store)
             others[-1](run, RunOutcome({"status": "ok"}))
@@ -249,7 +249,7 @@ def handler(request) -> Iterator[Any]:
 def test_interrupt_or_termination_within_the_block_is_told_at_its_end(handler, number):
     steps: list[str] = []
 
-    def interrupted_block() -> None:
+    def interrupted_block():
         with terminations_as_interrupts(), deferred_interrupt():
             try:
                 signal.raise_signal(number)

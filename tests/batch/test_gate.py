@@ -102,7 +102,7 @@ def test_a_run_that_fails_now_or_lost_a_score_does_not_pass_and_says_why(
 
 
 def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_path):
-    def timed(factor: float) -> RecordedBatch:
+    def timed(factor):
         slow = updated(batch, lambda run: {TIME: factor * (3 + 0.1 * run.seed)})
         return replace(slow, metrics=[ATE, TIME])
 

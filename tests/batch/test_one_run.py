@@ -83,7 +83,7 @@ def test_a_log_is_that_of_the_plan_or_gives_no_result(planned, tmp_path, monkeyp
     run = replace(of_log(planned(), log), landmarks={}, seed=0)
     read = one_run.read_source
 
-    def read_and_changed(*given: Any) -> Sequence:
+    def read_and_changed(*given):
         sequence = read(*given)
         log.write_text("20")
         return sequence
@@ -102,7 +102,7 @@ def log_with_duration(
 ) -> Path:
     """A file with a number in it, which is read as a simulated mission that lasts so long."""
 
-    def read(options: LogOptions) -> Sequence:
+    def read(options):
         return mission(int(Path(options.log).read_text()))
 
     monkeypatch.setitem(KINDS, "mcap", SourceKind(LogOptions, read))

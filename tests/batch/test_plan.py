@@ -73,7 +73,7 @@ def test_a_run_s_key_changes_with_class_and_python_version(
     suite = HEADER.replace("dead-reckoning", "dies")
     keys = set()
 
-    def planned() -> None:
+    def planned():
         versions_of.cache_clear()
         (run,) = plan(suite, BASIN, '[[estimators]]\nname = "dies"\n')
         keys.add(run.key)
@@ -92,7 +92,7 @@ def test_a_run_s_key_changes_with_class_and_python_version(
 def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     (tmp_path / "other").mkdir()
 
-    def hashed(name: str, content: bytes) -> dict[str, str]:
+    def hashed(name, content):
         (tmp_path / name).write_bytes(content)
         return fingerprint(LOG, {"log": str(tmp_path / name)})
 
@@ -104,7 +104,7 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
 def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
     """Names and contents of the first three are the same characters one after the other."""
 
-    def content_of(name: str) -> str:
+    def content_of(name):
         return fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"]
 
     found = []
@@ -172,7 +172,7 @@ def package(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def hashed() -> Iterator[Hashed]:
-    def anew() -> str:
+    def anew():
         source_hash.cache_clear()
         return source_hash("hashed_package")
 

@@ -59,7 +59,7 @@ def test_pairs_have_the_same_log_and_seed():
 
 
 def test_what_is_no_batch_is_refused_with_the_file_at_fault(tmp_path):
-    def refused(told: str, *reference: str) -> None:
+    def refused(told, *reference):
         with pytest.raises(EvaluationError, match=told):
             read_batch(tmp_path, *reference)
 

@@ -53,7 +53,7 @@ def dive(tmp_path) -> Path:
 def reply(run, capsys) -> Callable[..., Any]:
     """Gives what ``sonar-graph`` prints with these arguments, after its expected exit code."""
 
-    def answer(code: int, *arguments: object) -> Any:
+    def answer(code, *arguments):
         assert run(*arguments) == code
         return capsys.readouterr()
 
@@ -64,8 +64,8 @@ def reply(run, capsys) -> Callable[..., Any]:
 def refuse(reply, monkeypatch) -> Callable[[Path, str, str], None]:
     """Checks that a command, given in a folder, ends with code 2 and one line that names why, and writes no file."""
 
-    def check(folder: Path, command: str, expected: str) -> None:
-        def written() -> dict[Path, tuple[int, int]]:
+    def check(folder, command, expected):
+        def written():
             stats = {path: path.stat() for path in folder.rglob("*") if path.is_file()}
             return {path: (one.st_size, one.st_mtime_ns) for path, one in stats.items()}
 

@@ -151,7 +151,7 @@ def test_a_signal_ends_a_comparison_in_one_line_and_leaves_nothing_of_it(
 def test_failed_run_is_written_and_reported_by_exit_code(
     dive, tmp_path, monkeypatch, reply
 ):
-    def fail(*_: object) -> None:
+    def fail(*_):
         raise RuntimeError("the filter is tired")
 
     monkeypatch.setattr("baselines.dead_reckoning.DeadReckoning.process", fail)

@@ -100,7 +100,7 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
     from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
     from sonar_graph.simulation.sonar_image import SCENES, ImageOptions
 
-    def helps_of(*path: str) -> dict[str, str]:
+    def helps_of(*path):
         return {option.name: option.help for option in commands()[path].params}
 
     options = BasinOptions()

@@ -206,7 +206,7 @@ def test_unforeseen_error_is_not_hidden(basin, monkeypatch):
 
 
 def raising(error: Any) -> Callable[..., None]:
-    def stopped(*_: object) -> None:
+    def stopped(*_):
         raise error
 
     return stopped

@@ -112,7 +112,7 @@ def install(monkeypatch) -> Callable[..., None]:
     """Make classes known as estimators, beside ``offset`` and ``broken``: ``install(name=Class)``."""
     installed: dict[str, Any] = {"offset": Offset, "broken": Broken}
 
-    def load(name: str) -> Any:
+    def load(name):
         if name not in installed:
             raise UnknownEstimatorError(f"no estimator is called {name!r}")
         return installed[name]

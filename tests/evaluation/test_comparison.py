@@ -11,7 +11,6 @@ from sonar_graph.evaluation.scores import (
     landmark_scores,
 )
 from sonar_graph.logs import read_log, write_log
-from sonar_graph.measurements import Measurements
 from sonar_graph.report import sentences
 from sonar_graph.report.figures.maps import true_landmarks_drawn
 from sonar_graph.report.landmark_table import landmark_table
@@ -85,7 +84,7 @@ def test_all_are_scored_at_the_instants_that_all_have(install):
     begin_ns = 4_000_000_000
 
     class Late(Offset):
-        def process(self, measurements: Measurements) -> Estimate | None:
+        def process(self, measurements):
             is_late = measurements.end_ns >= begin_ns
             return super().process(measurements) if is_late else None
 
@@ -127,7 +126,7 @@ def test_without_enough_truth_the_rest_is_scored(install):
 def test_mistakes_of_the_user_are_raised_before_anything_runs(
     install, arguments, error, said
 ):
-    def progress(*_: object) -> None:
+    def progress(*_):
         pytest.fail("something ran")
 
     with pytest.raises(error, match=said):
@@ -145,7 +144,7 @@ def test_the_environment_has_versions_machine_and_command(install):
     install(one=Offset, two=Offset)
     calls: list[tuple[str, int, int]] = []
 
-    def progress(*call: object) -> None:
+    def progress(*call):
         calls.append(call)
 
     sequence = straight_sequence(2.0)
@@ -168,7 +167,7 @@ def surveyed_elsewhere(offset_m: float = 0.0, *, has_truth: bool = False) -> Any
     covs = np.tile(np.diag([1e-4, 4e-4, 1e-4]), (8, 1, 1))
 
     class Surveyor(Offset):
-        def landmarks(self) -> LandmarkMap:
+        def landmarks(self):
             return LandmarkMap(ids, found, covs)
 
     world = np.array([TURNED.transformFrom(place) for place in places])

@@ -142,3 +142,11 @@ def test_likeness_is_the_correlation_of_successive_sightings_of_a_landmark():
         found = consistency.likeness(sightings(0.8, **none))
         assert found.pairs == 0
         np.testing.assert_array_equal(found.correlation, 0.0)
+
+
+def test_nis_takes_used_detections_only():
+    outcomes = [Outcome.NEW, Outcome.USED, Outcome.GATED]
+    covs = np.tile(np.diag([4.0, 1.0]), (3, 1, 1))
+    innovations = np.tile([2.0, 3.0], (3, 1))
+    log = DetectionLog(np.arange(3), np.ones(3, int), innovations, covs, outcomes)
+    np.testing.assert_allclose(consistency.nis(log), [1.0 + 9.0])

@@ -51,7 +51,7 @@ def judged(
 def test_errors_of_an_unknown_world_are_those_of_a_known_one(known, orientation):
     found = judged(known, UNKNOWN, FAR, orientation=orientation)
 
-    def differs(name: str, key: str) -> float:
+    def differs(name, key):
         values = (one.scores[name][key].value for one in (found, known))
         return abs(np.subtract(*values))
 

@@ -171,6 +171,17 @@ def test_unnamed_landmarks_are_matched_as_the_best_of_all_matchings_says(seed, n
     assert np.sum(matched.horizontal_m**2) == pytest.approx(-best[1])
 
 
+def test_landmarks_are_matched_by_identity_not_by_row():
+    places = cloud(0, 4)
+    true = landmark_map([6, 8, 20, 40], places)
+    errors = metrics.landmark_errors(landmark_map([5, 8, 20, 30], places + 1), true)
+    np.testing.assert_array_equal(errors.ids, [8, 20])
+    np.testing.assert_allclose(errors.horizontal_m, 1.0)
+    one = landmark_map([6], places[:1])
+    # one landmark cannot be aligned
+    assert np.isnan(metrics.landmark_errors(one, true).aligned_rmse_m)
+
+
 def cloud(seed: int, n: int = 30) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(n, 3)) * [5.0, 3.0, 1.0]
 

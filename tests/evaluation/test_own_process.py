@@ -108,7 +108,7 @@ def test_an_estimator_cannot_change_another_s_process(plugin, mission):
 
 
 def test_a_process_of_its_own_gives_the_same_numbers(plugin, mission, monkeypatch):
-    def ran() -> tuple[bytes, list[object]]:
+    def ran():
         steps = []
         told = {"progress": lambda *step: steps.append(step)}
         run = run_estimator(mission, "dead-reckoning", **told)
@@ -153,7 +153,7 @@ def test_a_process_that_ends_by_itself_is_named_with_its_code():
 
 @pytest.mark.parametrize("failure", [RuntimeError, None])
 def test_an_interrupt_is_no_failure_of_the_estimator(mission, monkeypatch, failure):
-    def swallow(*_: object) -> None:
+    def swallow(*_):
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)

@@ -30,7 +30,7 @@ NS = 10**9
 
 
 def test_few_rows_are_named_each_and_many_are_counted_by_sensor_and_reason():
-    def told(*rows: RefusedRow) -> list[tuple[str, int, str, str]]:
+    def told(*rows):
         found = gathered(rows)
         return [(r.sensor, r.count, r.times(-NS), r.distances()) for r in found]
 
@@ -254,7 +254,7 @@ def test_headings_and_fixes_of_another_stamp_unit_are_refused(straight, name, un
     }
     for sensor, (kind, *columns) in kinds.items():
 
-        def refused(step_ns: int, sensor=sensor, kind=kind, columns=columns) -> Counter:
+        def refused(step_ns, sensor=sensor, kind=kind, columns=columns):
             stamps_ns = straight.imu.stamps_ns[0] + step_ns * np.arange(20)
             block = {sensor: kind(stamps_ns, *columns)}
             run = run_estimator(replace(straight, **block), name)

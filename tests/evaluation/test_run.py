@@ -24,7 +24,7 @@ MEGABYTES = 80
 def ran(install) -> Callable[..., RunResult]:
     """Run an estimator that is `Offset` but for some methods; ``ran.made`` has its instances, the first warmed up."""
 
-    def run(sequence=None, settings=None, *, options=None, **methods) -> RunResult:
+    def run(sequence=None, settings=None, *, options=None, **methods):
         class Own(Offset):
             def __init__(self, *arguments):
                 super().__init__(*arguments)
@@ -195,7 +195,7 @@ def test_mistakes_of_the_user_are_raised(ran, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         ran(process=interrupted)
 
-    def load(name: str):
+    def load(name):
         raise EstimatorError(f"{name} cannot be loaded: No module named 'torch'")
 
     monkeypatch.setattr(run_module, "load_estimator", load)

@@ -75,14 +75,7 @@ DIFFERENCES_M = [[-0.19, -0.07], [-0.26, -0.01], [-0.15, 0.15], [-0.14, 0.18]]
 
 
 def test_published_errors_are_those_of_the_published_table():
-    """Against plane geometry in complex numbers: a shift removes the mean, the best turn has the phase of a sum."""
     np.testing.assert_allclose(ESTIMATED_XY_M - TRUE_XY_M, DIFFERENCES_M, atol=1e-12)
-    estimated, true = (xy @ [1, 1j] for xy in (ESTIMATED_XY_M, TRUE_XY_M))
-    own, fixed = (xy - xy.mean() for xy in (estimated, true))
-    turn = np.vdot(own, fixed)
-    differences = (estimated - true, own - fixed, own * turn / abs(turn) - fixed)
-    raw, shifted, aligned = (np.sqrt(np.mean(np.abs(d) ** 2)) for d in differences)
     errors = landmark_errors(*published_maps())
-    assert rmse(errors.horizontal_m) == pytest.approx(raw)
-    assert errors.aligned_rmse_m == pytest.approx(aligned)
-    assert (raw, shifted, aligned) == pytest.approx((0.227, 0.115, 0.093), abs=5e-4)
+    found = rmse(errors.horizontal_m), errors.aligned_rmse_m
+    assert found == pytest.approx((0.227, 0.093), abs=5e-4)

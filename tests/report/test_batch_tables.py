@@ -126,7 +126,7 @@ def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
 
 
 def test_of_all_logs_together_seeds_are_counted():
-    def compared(batch: RecordedBatch) -> dict[str, tuple[str, str]]:
+    def compared(batch):
         rows = tables.difference_table(batch, ATE, compared_runs(batch)).rows
         own = [row for row in rows if row[1].text == "isam2"]
         return {row[0].text: (row[2].text, row[5].text) for row in own}

@@ -121,7 +121,7 @@ def test_page_is_whole_whatever_is_missing(comparison, change):
 
 @pytest.mark.usefixtures("unrendered")
 def test_without_landmarks_no_figure_of_them_is_announced(comparison):
-    def figures_in(html: str) -> list[str]:
+    def figures_in(html):
         return re.findall(r'<figure id="figure-([\w-]+)"', html)
 
     alone = only(comparison, "dead-reckoning")

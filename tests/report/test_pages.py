@@ -168,7 +168,7 @@ def test_a_page_can_be_read_without_seeing_it(page, kind):
 def contrast(first: str, second: str) -> float:
     """WCAG 2.1 contrast ratio."""
 
-    def luminance(colour: str) -> float:
+    def luminance(colour):
         parts = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
         linear = np.where(
             parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4

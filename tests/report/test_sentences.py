@@ -38,6 +38,8 @@ from tests.synthetic import (
     with_score,
 )
 
+BASIN = basin_comparison(60)
+
 
 def printed(comparison: Comparison, width: int = 80, shown: Any = None) -> str:
     options: dict[str, Any] = {
@@ -55,7 +57,7 @@ def nees(value: float, interval: tuple[float, float] | None = None) -> Score:
 
 
 def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
-    comparison = basin_comparison(60)
+    comparison = BASIN
     text = printed(comparison)
     lines = text.splitlines()
     keys = "ate_se2_m", "ate_raw_m", "yaw_rmse_rad", "nees_yaw"
@@ -92,13 +94,15 @@ def test_a_failure_is_printed_with_its_reason():
 )
 def test_a_nees_outside_its_interval_is_marked(value, interval, shown):
     score = nees(value, interval)
-    text = printed(with_score(basin_comparison(60), "isam2", "causal.nees_yaw", score))
+    text = printed(with_score(BASIN, "isam2", "causal.nees_yaw", score))
     assert shown in next(line for line in text.splitlines() if "isam2" in line)
     assert "▲ over-confident, ▼ over-cautious" in text
+    assert nees(1.0, (0.9, 1.1)).verdict == "consistent"
+    assert nees(4.9, (0.0, 5.0)).verdict == "", "so wide that it says nothing"
 
 
 def test_odometry_far_from_its_reference_leads_to_inspect():
-    comparison = basin_comparison(60)
+    comparison = BASIN
     sequence = replace(comparison.sequence, detections=None)
     blind = replace(comparison, sequence=sequence)
     notes = {"truth": "of the same sensors"}
@@ -126,7 +130,7 @@ WITHHELD = "landmark 3, from keyframe 1 at 1.000 s: 1 range; open: z; an elevati
 def scored(**values: float) -> Comparison:
     """Runs whose causal errors have these values, without runs that have none."""
     errors_m = {name.replace("_", "-"): value for name, value in values.items()}
-    comparison = only(basin_comparison(60), *errors_m)
+    comparison = only(BASIN, *errors_m)
     for name, value in errors_m.items():
         score = Score(value, "m", "By hand.")
         comparison = with_score(comparison, name, "causal.ate_se2_m", score)
@@ -134,7 +138,7 @@ def scored(**values: float) -> Comparison:
 
 
 def test_without_detections_the_drift_is_explained():
-    comparison = basin_comparison(60)
+    comparison = BASIN
     assert sentences.remarks(comparison) == []
     part = {"log.part": "the beginning to 10.000 s"}
     heading = Heading(np.zeros(1, int), np.zeros(1), np.ones(1))
@@ -149,7 +153,7 @@ def test_without_detections_the_drift_is_explained():
 
 
 def test_the_headline_leaves_out_what_has_no_error():
-    comparison = basin_comparison(60)
+    comparison = BASIN
     failed = with_failure(comparison, "ekf-slam", "no odometry.")
     assert sentences.doubts(failed)[0] == "ekf-slam failed: no odometry."
     assert "ekf-slam" not in sentences.headline(failed)
@@ -168,7 +172,7 @@ def test_the_headline_leaves_out_what_has_no_error():
 @pytest.mark.parametrize("gated", [19, 21])
 def test_an_estimator_that_rejects_a_fifth_is_called_lost(gated):
     log = log_of([Outcome.GATED] * gated + [Outcome.USED] * (100 - gated), [0.1] * 100)
-    comparison = basin_comparison(60)
+    comparison = BASIN
     run = replace(comparison.runs[1], detections=log, params={})
     lost = with_run(comparison, run)
     told = sentences.lost_runs(lost)
@@ -194,7 +198,7 @@ def with_map(
     **changes: object,
 ) -> Comparison:
     """One run whose landmarks are so far from the true ones along x, with a sigma of 2 cm."""
-    comparison = only(basin_comparison(60), "isam2")
+    comparison = only(BASIN, "isam2")
     positions = LANDMARKS + np.outer(offsets_m, [1, 0, 0])
     found = LandmarkMap(ids, positions, np.tile(SIGMA_M**2 * np.eye(3), (4, 1, 1)))
     params = {"identity": {"policy": "robust"}}
@@ -231,7 +235,7 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
 
 
 def test_without_true_landmarks_the_innovations_of_used_detections_tell():
-    def doubts(log: DetectionLog, *, has_truth: bool = False) -> list[str]:
+    def doubts(log, *, has_truth=False):
         shown = with_map(has_truth=has_truth, detections=log)
         return sentences.doubt_of_identities(shown)
 
@@ -305,7 +309,7 @@ def raw_score(comparison: Comparison) -> Score:
 
 @pytest.mark.parametrize("is_named", [True, False])
 def test_beside_a_sensor_that_is_named_no_right_one_is_to_be_left_out(is_named: bool):
-    stamps_ns = basin_comparison(60).sequence.start_ns + NS * np.arange(1, 11)
+    stamps_ns = BASIN.sequence.start_ns + NS * np.arange(1, 11)
     depth = Depth(stamps_ns, np.zeros(10), np.full(10, np.nan))
     rows = [RefusedRow("depth", int(t), Refusal.OUT_OF_REACH, 99.0) for t in stamps_ns]
     refused = refusing(rows, "isam2")
@@ -319,7 +323,7 @@ def test_beside_a_sensor_that_is_named_no_right_one_is_to_be_left_out(is_named: 
 
 @pytest.mark.usefixtures("unrendered")
 def test_terminal_and_page_list_refused_and_withheld_rows():
-    calm = basin_comparison(60)
+    calm = BASIN
     start_ns = calm.sequence.start_ns
     refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
     comparison = with_run(refused, replace(refused.runs[0], withheld=[WITHHELD]))
@@ -350,7 +354,7 @@ def test_terminal_and_page_list_refused_and_withheld_rows():
 def test_landmarks_that_moved_are_doubted_where_the_start_is_less_certain_than_the_map(
     start_sigma_m, count
 ):
-    given = basin_comparison(60).sequence.calibration
+    given = BASIN.sequence.calibration
     known = KnownMap.of([1], [[0.0, 0.0, 0.0]], sigma_m=0.05)
     sigmas_m = (start_sigma_m, 0.01, 1.0)
     start = given.start.model_copy(update={"position_sigma_m": sigmas_m})
@@ -363,7 +367,7 @@ def test_landmarks_that_moved_are_doubted_where_the_start_is_less_certain_than_t
 
 
 def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
-    def said(far: int, outcome: Outcome = Outcome.USED, off_m: float = 1) -> list[str]:
+    def said(far, outcome=Outcome.USED, off_m=1):
         outcomes = [Outcome.USED] * (100 - far) + [outcome] * far
         log = log_of(outcomes, [0.01] * (100 - far) + [off_m] * far)
         return sentences.outliers(with_map(detections=log))
@@ -381,7 +385,7 @@ def test_outliers_among_used_detections_are_named_from_a_twentieth_on():
 def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_write():
     noise = np.random.default_rng(3).standard_normal(400)
 
-    def said(rho: float = 0.8, count: int = 400, size: float = 1, **changes) -> str:
+    def said(rho=0.8, count=400, size=1, **changes):
         errors = noise[:count].copy()
         for k in range(1, count):
             errors[k] = rho * errors[k - 1] + np.sqrt(1 - rho**2) * noise[k]
@@ -392,14 +396,14 @@ def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_
         assert len(found) < 2
         return "".join(found)
 
-    def number(pattern: str, line: str) -> float:
+    def number(pattern, line):
         return float(re.search(pattern.replace("N", "([.0-9]+)"), line)[1])
 
     line = said()
     assert number("correlation N in 399 pairs", line) == pytest.approx(0.8, abs=0.1)
     assert line.startswith("Warning: isam2: errors of range are alike")
     # by hand: the mean of such errors has (1 + rho) / (1 - rho) times the variance
-    sequence = basin_comparison(60).sequence
+    sequence = BASIN.sequence
     expected_m = 3.0 * sequence.calibration.sonar.range_sigma_m
     sigma_m = number("`range_sigma_m = N` under", line)
     assert sigma_m == pytest.approx(expected_m, rel=0.3)
@@ -420,7 +424,7 @@ def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_
 
 
 def test_runs_that_agree_with_each_other_and_not_with_the_truth_share_a_fault():
-    def said(*offs_m: float) -> list[str]:
+    def said(*offs_m):
         comparison = basin_comparison(60)
         for name, off_m in zip(("isam2", "ekf-slam"), offs_m, strict=True):
             errors = comparison.errors[name]["causal"]
