@@ -93,7 +93,7 @@ def misbehaving(tmp_path, monkeypatch):
 def planned(plan) -> Callable[..., PlannedRun]:
     """The one run of a suite with a named estimator."""
 
-    def of(name: str = "dead-reckoning") -> PlannedRun:
+    def of(name="dead-reckoning"):
         header = HEADER.replace("dead-reckoning", name)
         (run,) = plan(header, BASIN, f'[[estimators]]\nname = "{name}"\n')
         return run
@@ -105,7 +105,7 @@ def planned(plan) -> Callable[..., PlannedRun]:
 def write_suite(tmp_path) -> WriteSuite:
     """Writes a suite from its parts and gives its path."""
 
-    def write(*parts: str) -> Path:
+    def write(*parts):
         path = tmp_path / "suite.toml"
         path.write_text("".join(parts) if parts else HEADER + BASIN + DEAD_RECKONING)
         return path

@@ -47,6 +47,7 @@ def noise(seed: int, mean: float, runs: int = 24) -> np.ndarray:
 
 EVERYWHERE = {*LOGS, "all logs"}
 POSITION = "causal.nees_position"
+TIME = "time.total_s"
 
 
 @pytest.mark.parametrize(
@@ -88,38 +89,32 @@ def test_a_run_that_fails_now_or_lost_a_score_does_not_pass_and_says_why(
     assert worsening.column == "status"
     assert worsening.explanation == "seed 0: timeout, took longer than 60 s"
     lost = without(batch, ATE)
-    (worsening,) = gate(
-        replace(batch, runs=[lost.runs[0], *batch.runs[1:]]), reference
-    ).worsenings
+    one_lost = replace(batch, runs=[lost.runs[0], *batch.runs[1:]])
+    (worsening,) = gate(one_lost, reference).worsenings
     assert worsening.column == ATE
     all_failed = replace(batch, runs=[failed(run) for run in batch.runs])
     assert len(gate(all_failed, reference).worsenings) == len(batch.runs)
-    for before, after in (
-        (failing, failing),
-        (failing, batch),
-        (lost, batch),
-    ):  # the reference has nothing better
+    # the reference has nothing better
+    for before, after in ((failing, failing), (failing, batch), (lost, batch)):
         verdict = judged(before, after, tmp_path)
         assert verdict.passed
         assert not verdict.look_at
 
 
-def slower(batch: RecordedBatch, factor: float) -> RecordedBatch:
-    """The batch, on a machine that takes so many times as long."""
-    timed = updated(batch, lambda run: {"time.total_s": factor * (3 + 0.1 * run.seed)})
-    return replace(timed, metrics=[ATE, "time.total_s"])
-
-
 def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_path):
+    def timed(factor):
+        slow = updated(batch, lambda run: {TIME: factor * (3 + 0.1 * run.seed)})
+        return replace(slow, metrics=[ATE, TIME])
+
     path = tmp_path / "reference.json"
-    bless(slower(batch, 1.0), path)
-    assert "time.total_s" not in path.read_text()
+    bless(timed(1.0), path)
     content = json.loads(path.read_text())
-    content["metrics"].append("time.total_s")
-    for entry, run in zip(content["runs"], slower(batch, 1.0).runs, strict=True):
-        entry["scores"]["time.total_s"] = run.values["time.total_s"]
+    assert TIME not in path.read_text()
+    content["metrics"].append(TIME)
+    for entry, run in zip(content["runs"], timed(1.0).runs, strict=True):
+        entry["scores"][TIME] = run.values[TIME]
     path.write_text(json.dumps(content))
-    assert gate(slower(batch, 4.0), path).passed
+    assert gate(timed(4.0), path).passed
 
 
 def script(*words: object) -> int:

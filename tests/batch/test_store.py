@@ -16,12 +16,9 @@ OUTCOME = RunOutcome(
 )
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.is_file()
-    )
+def names(folder: Path) -> set[str]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix() for path in files}
 
 
 def test_what_is_written_is_what_is_read(tmp_path):
@@ -29,16 +26,8 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert store.row("k") is None
     store.write("k", OUTCOME)
     assert store.row("k") == OUTCOME.row
-    assert names(tmp_path) == [
-        f"runs/k/{name}"
-        for name in (
-            ".sonar_graph.json",
-            "a.json",
-            "log.txt",
-            "row.json",
-            "runs/isam2/series.npz",
-        )
-    ]
+    own = {f"runs/k/{name}" for name in (".sonar_graph.json", "log.txt", "row.json")}
+    assert names(tmp_path) == own | {f"runs/k/{name}" for name in OUTCOME.files}
     assert (tmp_path / store.log_file("k")).read_text() == "said"
 
 
@@ -56,23 +45,19 @@ def test_a_process_that_dies_leaves_a_run_whole_or_gone(
     is_whole = store.run_folder("k").exists()
     assert store.row("k") == (OUTCOME.row if is_whole else None)
     store.remove_partial()
-    assert names(tmp_path) == (whole if is_whole else [])
+    assert names(tmp_path) == (whole if is_whole else set())
     store.write("k", OUTCOME)
     assert names(tmp_path) == whole
 
 
-def test_a_lost_or_foreign_row_counts_as_not_done(
-    tmp_path,
-):
+def test_a_lost_or_foreign_row_counts_as_not_done(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     (store.run_folder("k") / "row.json").write_bytes(b"")
     assert store.row("k") is None
-    for key in ("k", "other"):
-        store.write(key, OUTCOME)
-        assert store.row(key) == OUTCOME.row
-    for old, new in (("k", "aside"), ("other", "k"), ("aside", "other")):
-        store.run_folder(old).rename(store.run_folder(new))
+    store.write("k", OUTCOME)
+    assert store.row("k") == OUTCOME.row
+    store.run_folder("k").rename(store.run_folder("other"))
     assert store.row("k") is store.row("other") is None
 
 

@@ -4,7 +4,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import psutil
 import pytest
@@ -14,6 +13,8 @@ from sonar_graph.batch.supervision import Runner, perform_watched
 from sonar_graph.errors import BatchError
 
 AMPLE = Limits(600.0)
+SMALL = Limits(120.0, memory_mb=700.0)
+KILLED = "its process was ended by SIGKILL, 2 times"
 pytestmark = pytest.mark.slow
 
 
@@ -36,26 +37,11 @@ def runners() -> list[psutil.Process]:
 @pytest.mark.parametrize(
     ("estimator", "limits", "status", "reason"),
     [
-        (
-            "hungry",
-            Limits(120.0, memory_mb=700.0),
-            "memory",
-            "its processes needed more than 700 MB",
-        ),
-        (
-            "hungry-child",
-            Limits(120.0, memory_mb=700.0),
-            "memory",
-            "its processes needed more than 700 MB",
-        ),
+        ("hungry", SMALL, "memory", "its processes needed more than 700 MB"),
+        ("hungry-child", SMALL, "memory", "its processes needed more than 700 MB"),
         ("forks", Limits(5.0), "timeout", "took longer than 5 s"),
-        (
-            "dies-after-forking",
-            Limits(120.0),
-            "killed",
-            "its process was ended by SIGKILL, 2 times",
-        ),
-        ("dies", AMPLE, "killed", "its process was ended by SIGKILL, 2 times"),
+        ("dies-after-forking", AMPLE, "killed", KILLED),
+        ("dies", AMPLE, "killed", KILLED),
         ("dies-once", AMPLE, "ok", ""),
     ],
 )
@@ -64,9 +50,16 @@ def test_a_run_ends_with_its_child_processes(
 ):
     row = perform_watched(planned(estimator), limits).row
     assert (row["status"], row["reason"]) == (status, reason)
-    assert status == "ok" or not [
-        p for p in psutil.process_iter() if is_runner_of_this_test(p)
-    ]
+    assert status == "ok" or not any(map(is_of_this_test, psutil.process_iter()))
+
+
+def is_of_this_test(process: psutil.Process) -> bool:
+    """A runner or a child of one, which has its command and environment."""
+    mark = "SONAR_GRAPH_TEST_MARK"
+    with contextlib.suppress(psutil.Error):
+        is_runner = "sonar_graph.batch.one_run" in process.cmdline()
+        return is_runner and process.environ().get(mark) == os.environ[mark]
+    return False
 
 
 def is_runner_of_this_test(process: psutil.Process) -> bool:
@@ -87,9 +80,8 @@ def test_the_log_has_the_traceback_and_native_output_of_its_run_alone(
     runner = Runner()
     outcome = runner.perform(planned("prints"), AMPLE)
     assert outcome.row["status"] == "failed"
-    assert "written by native code" in outcome.log
-    assert "RuntimeError: diverged" in outcome.log
-    assert "Traceback" in outcome.log
+    for text in ("written by native code", "RuntimeError: diverged", "Traceback"):
+        assert text in outcome.log
     assert "runs/prints/series.npz" in outcome.files
     assert "diverged" not in runner.perform(planned(), AMPLE).log
     runner.end()
@@ -123,22 +115,15 @@ def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
     asked: list[str] = []
     ask = Runner._ask
 
-    def told(self: Runner, request: Any, limits: Limits) -> Any:
+    def told(self, request, limits):
         asked.append(f"{type(request).__name__} {limits.timeout_s:g}")
         return ask(self, request, limits)
 
     monkeypatch.setattr(Runner, "_ask", told)
-    rows = [
-        perform_watched(planned(name), AMPLE).row
-        for name in ("dead-reckoning", "dead-reckoning", "prints")
-    ]
-    assert asked == [
-        "Preparation 3600",
-        "PlannedRun 600",
-        "PlannedRun 600",
-        "PlannedRun 600",
-    ]
-    assert rows[0]["causal.ate_raw_m"] == rows[1]["causal.ate_raw_m"]
+    names = "dead-reckoning", "dead-reckoning", "prints"
+    first, again, _ = (perform_watched(planned(name), AMPLE).row for name in names)
+    assert asked == ["Preparation 3600", *["PlannedRun 600"] * 3]
+    assert first["causal.ate_raw_m"] == again["causal.ate_raw_m"]
 
 
 def test_a_warm_up_or_start_that_does_not_end_in_time_is_ended_and_named(
@@ -151,9 +136,8 @@ def test_a_warm_up_or_start_that_does_not_end_in_time_is_ended_and_named(
     assert (row["status"], row["reason"]) == ("timeout", "took longer than 0 s")
     assert not runners()
     monkeypatch.setattr(supervision, "START_S", 0.0)
-    with pytest.raises(
-        BatchError, match=r"no process for runs on .*: it was not ready after 0 s"
-    ):
+    told = r"no process for runs on .*: it was not ready after 0 s"
+    with pytest.raises(BatchError, match=told):
         Runner()
     assert not runners()
 
@@ -163,9 +147,8 @@ def test_process_of_runs_does_not_outlive_who_started_it():
         "from sonar_graph.batch.supervision import Runner; import time;"
         "print(Runner().pid, flush=True); time.sleep(1000)"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
-    ) as starter:
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as starter:
         runner = psutil.Process(int(starter.stdout.readline()))
         starter.kill()
     assert runner.wait(timeout=30) is None

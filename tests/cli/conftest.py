@@ -1,5 +1,6 @@
 """Commands as a user gives them, and a short log to give them."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -52,8 +53,27 @@ def dive(tmp_path) -> Path:
 def reply(run, capsys) -> Callable[..., Any]:
     """Gives what ``sonar-graph`` prints with these arguments, after its expected exit code."""
 
-    def answer(code: int, *arguments: object) -> Any:
+    def answer(code, *arguments):
         assert run(*arguments) == code
         return capsys.readouterr()
 
     return answer
+
+
+@pytest.fixture
+def refuse(reply, monkeypatch) -> Callable[[Path, str, str], None]:
+    """Checks that a command, given in a folder, ends with code 2 and one line that names why, and writes no file."""
+
+    def check(folder, command, expected):
+        def written():
+            stats = {path: path.stat() for path in folder.rglob("*") if path.is_file()}
+            return {path: (one.st_size, one.st_mtime_ns) for path, one in stats.items()}
+
+        before = written()
+        monkeypatch.chdir(folder)
+        said = reply(2, *command.split()).err
+        assert re.fullmatch(r"sonar-graph: .+\n", said)
+        assert re.search(expected, said), said
+        assert written() == before
+
+    return check

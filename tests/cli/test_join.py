@@ -23,7 +23,6 @@ from sonar_graph.logs import (
 )
 from sonar_graph.logs.mcap import recording
 from tests.logs.converters import copies
-from tests.logs.converters.sonar_recordings import Aris, images
 from tests.recognition.imaged_lane import TOPIC, Lane
 
 OFFSET_S = 2.4
@@ -31,16 +30,17 @@ OFFSET_S = 2.4
 
 def images_log(lane: Lane, path: Path, offset_s: float = OFFSET_S) -> Path:
     """The images by a clock that is behind, in a log that states what their samples mean."""
-    calibration = Calibration(
-        sonar=SonarCalibration(image=SonarImage(decibel_span=75.0))
-    )
-    frames = replace(
-        lane.frames, stamps_ns=lane.frames.stamps_ns - round(offset_s * 1e9)
-    )
-    own = calibration.model_dump_json(exclude_unset=True)
+    sonar = SonarCalibration(image=SonarImage(decibel_span=75.0))
+    stamps_ns = lane.frames.stamps_ns - round(offset_s * 1e9)
+    own = Calibration(sonar=sonar).model_dump_json(exclude_unset=True)
     with recording(path, {METADATA: {"calibration": own}}) as writer:
+        frames = replace(lane.frames, stamps_ns=stamps_ns)
         writer.write([sonar_image_messages(TOPIC, frames)])
     return path
+
+
+def stamps_of(log: Path) -> np.ndarray:
+    return np.concatenate([block.stamps_ns for block in read_sonar_frames(log)])
 
 
 @pytest.fixture(scope="module")
@@ -53,37 +53,29 @@ def both(lane, tmp_path_factory) -> tuple[Path, Path]:
 def test_images_are_moved_to_the_clock_of_the_navigation(lane, both, tmp_path, reply):
     out = tmp_path / "joined.mcap"
     said = reply(0, "join", *both, "-o", out).out
-    match = re.search(
-        r"Clock offset, to be added .*: \+(\d\.\d+) s ± (\d\.\d+) s", said
-    )
-    assert abs(float(match[1]) - OFFSET_S) < 3 * float(match[2]) + 0.01
+    found = re.search(r"Clock offset, to be added .*: (\+\S+) s ± (\S+) s", said)
+    offset_s, near_s = map(float, found.groups())
+    assert abs(offset_s - OFFSET_S) < 3 * near_s + 0.01
     assert f"{len(lane.frames)} frames, " in said
     joined = read_log(out)
     np.testing.assert_array_equal(joined.imu.stamps_ns, lane.sequence.imu.stamps_ns)
-    blocks = list(read_sonar_frames(out))
-    stamps = np.concatenate([block.stamps_ns for block in blocks])
-    np.testing.assert_allclose(
-        stamps, lane.frames.stamps_ns, atol=3e9 * float(match[2]) + 1e7
-    )
-    np.testing.assert_array_equal(
-        np.concatenate([block.intensity for block in blocks]), lane.frames.intensity
-    )
-    assert joined.notes["images.clock_offset"].startswith(f"+{match[1]} s")
+    near_ns = 3e9 * near_s + 1e7
+    np.testing.assert_allclose(stamps_of(out), lane.frames.stamps_ns, atol=near_ns)
+    images = np.concatenate([block.intensity for block in read_sonar_frames(out)])
+    np.testing.assert_array_equal(images, lane.frames.intensity)
+    assert joined.notes["images.clock_offset"].startswith(f"{found[1]} s")
     expected = lane.sequence.calibration
-    assert joined.calibration.sonar.mounting == expected.sonar.mounting
-    assert joined.calibration.sonar.image.decibel_span == 75.0
+    sonar = joined.calibration.sonar
+    assert sonar.mounting == expected.sonar.mounting
+    assert sonar.image.decibel_span == 75.0
     assert joined.calibration.model_copy(update={"sonar": expected.sonar}) == expected
 
 
 @pytest.fixture(scope="module")
 def few(lane, tmp_path_factory) -> Path:
     """Too few images to measure an offset by."""
-    first = slice(0, 12)
-    frames = replace(
-        lane.frames,
-        stamps_ns=lane.frames.stamps_ns[first],
-        intensity=lane.frames.intensity[first],
-    )
+    stamps_ns, images = lane.frames.stamps_ns[:12], lane.frames.intensity[:12]
+    frames = replace(lane.frames, stamps_ns=stamps_ns, intensity=images)
     log = tmp_path_factory.mktemp("few") / "images.mcap"
     return images_log(replace(lane, frames=frames), log)
 
@@ -135,16 +127,12 @@ def test_mounting_floor_and_start_of_a_given_file_are_in_the_joined_log(
 def test_a_stated_offset_is_taken_and_doubted_where_the_images_say_else(
     lane, both, tmp_path, reply
 ):
-    out = tmp_path / "joined.mcap"
-    said = reply(0, "join", *both, "-o", out, "--offset", OFFSET_S).out
+    words = "join", *both, "-o", tmp_path / "joined.mcap", "--offset"
+    said = reply(0, *words, OFFSET_S).out
     assert "+2.400 s, as stated; by the images +2.4" in said
     assert "Warning" not in said
-    stamps = np.concatenate([block.stamps_ns for block in read_sonar_frames(out)])
-    np.testing.assert_array_equal(stamps, lane.frames.stamps_ns)
-    assert (
-        "Warning: they do not agree"
-        in reply(0, "join", *both, "-o", out, "--offset", 3.5).out
-    )
+    np.testing.assert_array_equal(stamps_of(words[4]), lane.frames.stamps_ns)
+    assert "Warning: they do not agree" in reply(0, *words, 3.5).out
 
 
 def test_files_without_common_time_are_refused_with_an_offset(
@@ -152,36 +140,23 @@ def test_files_without_common_time_are_refused_with_an_offset(
 ):
     far = images_log(lane, tmp_path / "far.mcap", offset_s=1.2e9)
     out = tmp_path / "joined.mcap"
-    (line,) = reply(2, "join", far, both[1], "-o", out).err.splitlines()
-    found = re.search(
-        r"far\.mcap: \d.* s; .*nav\.mcap: \d.* s: no common time; .* \(\+(\d+\.\d+) makes",
-        line,
-    )
+    words = "join", far, both[1], "-o", out
+    (line,) = reply(2, *words).err.splitlines()
+    told = r"far\.mcap: \d.* s; .*nav\.mcap: \d.* s: no common time; .* \(\+(\d+\.\d+) makes"
+    found = re.search(told, line)
     assert found
     assert not out.exists()
-    words = "-o", out, "--offset", float(found[1]), "--search", 3
-    said = reply(0, "join", far, both[1], *words).out
+    said = reply(0, *words, "--offset", found[1], "--search", 3).out
     refined = re.search(r": \+(\d+\.\d+) s ± (\d\.\d+) s", said)
     assert abs(float(refined[1]) - 1.2e9) < 3 * float(refined[2])
 
 
 def test_an_offset_that_few_images_cannot_show_must_be_stated(
-    both, run, tmp_path, reply
+    both, few, tmp_path, reply
 ):
-    file = tmp_path / "dive.aris"
-    file.write_bytes(Aris(images(6, 128, 300)).content())
-    recorded = converted(run, file)
-    first_ns = next(read_sonar_frames(recorded)).stamps_ns[0]
-    offset_s = (read_log(both[1]).start_ns - first_ns) * 1e-9 + 1.0
     out = tmp_path / "joined.mcap"
-    words = "join", recorded, both[1], "-o", out, "--offset", f"{offset_s:.6f}"
-    few = "steps between them could be measured, and 50 are needed; state it"
-    assert few in reply(2, *words, "--search", 2).err
+    words = "join", few, both[1], "-o", out, "--offset", OFFSET_S
+    lack = "steps between them could be measured, and 50 are needed; state it"
+    assert lack in reply(2, *words, "--search", 2).err
     assert "as stated; the images do not determine" in reply(0, *words).out
-    assert sum(len(block) for block in read_sonar_frames(out)) == 6
-
-
-def converted(run, recorded: Path) -> Path:
-    out = recorded.with_suffix(".mcap")
-    assert run("convert", "aris", recorded, "-o", out) == 0
-    return out
+    assert len(stamps_of(out)) == 12

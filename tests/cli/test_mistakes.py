@@ -131,10 +131,15 @@ MISTAKES = {
     "simulate basin -o new.mcap --duration-s 1": "laps",
     "simulate basin -o new.mcap --laps many": "--laps",
     "simulate landmarks --on basin.mcap -o new.mcap --set spacing=4": "did you mean spacing_m",
-    "simulate landmarks --on basin.mcap -o basin.mcap --overwrite": "is what is read",
     "convert dataset mrclam empty --number 1 -o new.mcap": "empty",
     "convert dataset dlr empty --number 1 -o new.mcap": "data set dlr: expected FOLDER",
     "report empty": "empty",
+    "label basin.mcap -o new.json --map empty": "No such option: --map",
+    "recognise basin.mcap -o new.mcap --map empty": "No such option: --map",
+    "calibrate basin.mcap -o new.json --map empty": "No such option: --map",
+    "join basin.mcap basin.mcap -o new.mcap --map empty": "No such option: --map",
+    "calibration basin.mcap --map empty": "No such option: --map",
+    "simulate landmarks --on basin.mcap -o new.mcap --map empty": "No such option: --map",
     "calibration": "give --template",
     "report killed": "before any of its runs was done; give the bench command that began it again",
     "bench logs.toml -o out": r"logs\.toml, line 3: logs",
@@ -147,7 +152,6 @@ MISTAKES = {
     "recognise lane.mcap -o new.mcap --designs broken.toml": r"broken\.toml.*size_m",
     "recognise lane.mcap -o new.mcap --designs large.toml": r"plate \(id 4\) would never be found",
     "recognise lane.mcap -o new.mcap --designs empty": "empty: no landmark designs",
-    "recognise lane.mcap -o lane.mcap --overwrite": "is what is read",
     "recognise lane.mcap -o new.mcap --topic sonar=/none": "/none was chosen but is not in the log",
     "recognise lane.mcap -o new.mcap --rule jeffrey --set identity.rule=jeffrey": "--rule jeffrey and --set .*one of",
     "recognise lane.mcap -o new.mcap --set least_frames=many": "least_frames",
@@ -175,31 +179,24 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("command", "expected"), MISTAKES.items())
 def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
-    command, expected, files, monkeypatch, reply
+    command, expected, files, refuse
 ):
-    def written() -> dict[Path, tuple[int, int]]:
-        stats = {path: path.stat() for path in files.rglob("*") if path.is_file()}
-        return {path: (one.st_size, one.st_mtime_ns) for path, one in stats.items()}
-
-    before = written()
-    monkeypatch.chdir(files)
-    said = reply(2, *command.split()).err
-    assert re.fullmatch(r"sonar-graph: .+\n", said)
-    assert re.search(expected, said), said
-    assert written() == before
+    refuse(files, command, expected)
 
 
 @pytest.mark.parametrize(
-    "stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")]
+    ("stop", "code"),
+    [
+        (KeyboardInterrupt, 130),
+        (PermissionError(13, "Permission denied", "x.mcap"), 2),
+    ],
 )
 def test_interruption_and_refused_access_end_in_one_line(
-    stop, basin, monkeypatch, reply
+    stop, code, basin, monkeypatch, reply
 ):
     monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(stop))
-    assert re.fullmatch(
-        r"sonar-graph: .+\n",
-        reply(130 if stop is KeyboardInterrupt else 2, "inspect", basin).err,
-    )
+    said = reply(code, "inspect", basin).err
+    assert re.fullmatch(r"sonar-graph: .+\n", said)
 
 
 def test_unforeseen_error_is_not_hidden(basin, monkeypatch):
@@ -209,7 +206,7 @@ def test_unforeseen_error_is_not_hidden(basin, monkeypatch):
 
 
 def raising(error: Any) -> Callable[..., None]:
-    def stopped(*_: object) -> None:
+    def stopped(*_):
         raise error
 
     return stopped

@@ -114,14 +114,9 @@ WRONG = {
 
 @pytest.mark.parametrize(("command", "expected"), WRONG.items())
 def test_a_wrong_use_is_one_line_that_says_what_to_do(
-    folder, command, expected, monkeypatch, reply
+    folder, command, expected, refuse
 ):
-    before = sorted(folder.rglob("*"))
-    monkeypatch.chdir(folder)
-    said = reply(2, *command.split()).err
-    assert re.fullmatch(r"sonar-graph: .+\n", said)
-    assert re.search(expected, said), said
-    assert sorted(folder.rglob("*")) == before
+    refuse(folder, command, expected)
 
 
 def test_times_that_run_backwards_are_sorted_and_named(run, folder, tmp_path, capsys):
@@ -148,43 +143,33 @@ def test_a_truth_of_tables_may_lack_its_orientation(folder, tmp_path):
 
 def test_tables_with_another_unit_of_velocity_are_reported(folder, tmp_path, reply):
     (tmp_path / "dive.toml").write_text(GOOD + "scale = 1000\n")
-    out = tmp_path / "new.mcap"
+    unit = r"warning: DVL: unit: velocities look 1000 times too large .*`scale = 0\.001` .*dive\.toml"
     for config, told in (
-        (
-            tmp_path / "dive.toml",
-            r"warning: DVL: unit: velocities look 1000 times too large .*`scale = 0\.001` .*dive\.toml",
-        ),
+        (tmp_path / "dive.toml", unit),
         (folder / "good.toml", "^((?!: unit).)*$"),
     ):
-        assert re.search(
-            told,
-            " ".join(
-                reply(
-                    0, "convert", "csv", folder, "--config", config, "-o", out
-                ).err.split()
-            ),
-        )
+        words = folder, "--config", config, "-o", tmp_path / "new.mcap"
+        said = reply(0, "convert", "csv", *words).err
+        assert re.search(told, " ".join(said.split()))
 
 
-def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path, reply):
+def test_inspect_ends_with_a_status_for_scripts(run, folder, tmp_path):
     world = small_world()
-    assert run("inspect", folder / "dive.mcap", "--quick") == 0
-    assert run("inspect", folder / "fast.mcap") == 3
     frd = replace(world.imu, specific_force=world.imu.specific_force * [1, -1, -1])
     write_log(tmp_path / "frd.mcap", replace(world, imu=frd))
-    assert run("inspect", tmp_path / "frd.mcap", "--quick") == 3
     content = (folder / "dive.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
-    reply(1, "inspect", tmp_path / "cut.mcap", "--quick")
+    for code, *words in (
+        (0, folder / "dive.mcap", "--quick"),
+        (3, folder / "fast.mcap"),
+        (3, tmp_path / "frd.mcap", "--quick"),
+        (1, tmp_path / "cut.mcap", "--quick"),
+    ):
+        assert run("inspect", *words) == code
 
 
 @pytest.mark.parametrize("content", ['{"a": 1}', "words", "[]"])
-def test_a_json_file_of_others_does_not_become_a_model(
-    content, basin, run, tmp_path, capsys
-):
-    mine = tmp_path / "mine.json"
-    mine.write_text(content)
-    assert run("calibrate", basin, "-o", mine) == 2
+def test_a_json_file_of_others_does_not_become_a_model(content, basin, refuse):
+    (basin.parent / "mine.json").write_text(content)
     said = "and sonar-graph did not write it; choose another name, or give --overwrite"
-    assert said in capsys.readouterr().err
-    assert mine.read_text() == content
+    refuse(basin.parent, "calibrate basin.mcap -o mine.json", said)

@@ -7,7 +7,6 @@ from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -30,25 +29,23 @@ shapes = [{ level_db = 12.0, circle_m = [0.0, 0.0, 0.15] }]
 """
 
 
-class Recognised(NamedTuple):
-    """The log with what was recognised in it, and what the command printed."""
-
-    log: Path
-    said: str
-
-
 @pytest.fixture(scope="module")
-def command(lane_log, run, tmp_path_factory) -> Recognised:
+def command(lane_log, run, tmp_path_factory) -> tuple[Path, str]:
+    """The log with what was recognised in it, and what the command printed."""
     out = tmp_path_factory.mktemp("recognised") / "out.mcap"
     said = StringIO()
     with redirect_stdout(said):
         assert run("recognise", lane_log, "-o", out) == 0
-    return Recognised(out, said.getvalue())
+    return out, said.getvalue()
 
 
 @pytest.fixture(scope="module")
 def recognised(command) -> Path:
-    return command.log
+    return command[0]
+
+
+def topics_of(path: Path) -> set[str]:
+    return {topic for topic, _, _ in contents(path)}
 
 
 @pytest.fixture(scope="module")
@@ -81,114 +78,72 @@ def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(
 
 
 def test_recognise_says_what_became_of_everything(lane, lane_recognition, command):
-    said = command.said
-    assert (
-        f"{len(lane.frames)} frames, {len(lane_recognition.detections)} detections"
-        in said
-    )
+    _, said = command
+    found = lane_recognition.detections
+    assert f"{len(lane.frames)} frames, {len(found)} detections" in said
     for outcome, count in lane_recognition.outcomes.items():
-        assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE), (
-            outcome
-        )
+        assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE)
     assert said.rstrip().endswith("out.mcap")
-    ids, probability = lane_recognition.detections.most_probable()
-    counts = [
-        f"landmark {k}: {np.count_nonzero((ids == k) & (probability > 0.5))}"
-        for k in (1, 2, 3, 4)
-    ]
-    rest = np.count_nonzero(probability <= 0.5)
-    assert f"Most probable: {', '.join(counts)}, none of them: {rest}\n" in said
+    ids, probability = found.most_probable()
+    counts = Counter(ids[probability > 0.5].tolist())
+    each = ", ".join(f"landmark {k}: {counts[k]}" for k in (1, 2, 3, 4))
+    rest = len(ids) - counts.total()
+    assert f"Most probable: {each}, none of them: {rest}\n" in said
     assert "Warning" not in said
 
 
 def test_recognising_again_replaces_what_was_there(recognised, tmp_path, reply):
-    assert (
-        "Replaced: "
-        in reply(
-            0,
-            "recognise",
-            recognised,
-            "-o",
-            tmp_path / "again.mcap",
-            "--rule",
-            "jeffrey",
-        ).out
-    )
-    one = read_log(recognised).detections
-    other = read_log(tmp_path / "again.mcap").detections
+    again = tmp_path / "again.mcap"
+    words = "recognise", recognised, "-o", again, "--rule", "jeffrey"
+    assert "Replaced: " in reply(0, *words).out
+    one, other = (read_log(path).detections for path in (recognised, again))
     assert set(one.track.tolist()) == set(other.track.tolist())
     assert not np.isin(one.id_probability, other.id_probability).all()
 
 
 @pytest.mark.usefixtures("unrendered")
 def test_compare_recognises_by_itself_and_gives_what_recognise_gives(
-    lane_log, recognised, run, tmp_path, capsys
+    lane_log, recognised, tmp_path, reply
 ):
-    assert run("compare", lane_log, "-o", tmp_path / "images", *QUICK) == 0
-    assert run("compare", recognised, "-o", tmp_path / "detections", *QUICK) == 0
-    pages = [
-        (tmp_path / name / "report.html").read_text()
-        for name in ("images", "detections")
-    ]
-    assert 'id="recognition"' in pages[0]
-    assert 'id="recognition"' not in pages[1]
-    said = [
-        " ".join(text.split()) for text in capsys.readouterr().out.split("Report: ")
-    ]
+    said = []
+    for log, options, is_recognised in (
+        (lane_log, (), True),
+        (recognised, (), False),
+        (recognised, ("--rule", "virtual-evidence"), True),
+    ):
+        out = tmp_path / str(len(said))
+        told = reply(0, "compare", log, "-o", out, *QUICK, *options).out
+        said.append(" ".join(told.split()))
+        page = (out / "report.html").read_text()
+        assert ('id="recognition"' in page) == is_recognised
     assert "Most probable: landmark 1: " in said[0]
     assert "those that recognise put into the log" in said[1]
     assert "--rule virtual-evidence" in said[1]
-    assert (
-        run(
-            "compare",
-            recognised,
-            "-o",
-            tmp_path / "anew",
-            *QUICK,
-            "--rule",
-            "virtual-evidence",
-        )
-        == 0
-    )
-    assert 'id="recognition"' in (tmp_path / "anew" / "report.html").read_text()
-    assert (
-        json.loads((tmp_path / "images" / "recognition.json").read_text())["frames"]
-        > 100
-    )
-    topics = {topic for topic, _, _ in contents(tmp_path / "images" / "result.mcap")}
-    assert "/sonar/recognised" in topics
+    first = tmp_path / "0"
+    assert json.loads((first / "recognition.json").read_text())["frames"] > 100
+    assert "/sonar/recognised" in topics_of(first / "result.mcap")
 
 
 def test_a_model_that_calibrate_wrote_is_used(
     lane_log, run, tmp_path, monkeypatch, reply
 ):
     monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
-    said = reply(0, "calibrate", lane_log, "-o", tmp_path / "model.json").out
-    assert re.search(r"^  landmark 1: \d+ frames, 1 track$", said, re.MULTILINE)
-    assert re.search(
-        r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE
-    )
-    model = read_confusion(tmp_path / "model.json")
-    sigmas = f"  range sigma {1e3 * model.range_sigma_m:.1f} mm, across {1e3 * model.across_sigma_m:.1f} mm, "
-    of_errors = f"a track is reported every {model.report_interval_s:.1f} s\n"
-    assert f"{sigmas}{of_errors}" in said
-    assert (
-        "model.json: exists, and sonar-graph did not write it; choose"
-        in reply(2, "label", lane_log, "-o", tmp_path / "model.json").err
-    )
+    path = tmp_path / "model.json"
+    said = reply(0, "calibrate", lane_log, "-o", path).out
+    model = read_confusion(path)
+    sigmas = f"{1e3 * model.range_sigma_m:.1f} mm, across {1e3 * model.across_sigma_m:.1f} mm"
+    for told in (
+        r"^  landmark 1: \d+ frames, 1 track$",
+        "^Caution: fewer than 10 tracks of landmark 1, .*more logs",
+        f"^  range sigma {sigmas}, a track is reported every {model.report_interval_s:.1f} s$",
+    ):
+        assert re.search(told, said, re.MULTILINE)
+    own = "model.json: exists, and sonar-graph did not write it; choose"
+    assert own in reply(2, "label", lane_log, "-o", path).err
     assert model.provenance["logs"] == "lane.mcap"
-    assert (
-        run(
-            "recognise",
-            lane_log,
-            "-o",
-            tmp_path / "out.mcap",
-            "--model",
-            tmp_path / "model.json",
-        )
-        == 0
-    )
-    found = read_log(tmp_path / "out.mcap").detections
+    out = tmp_path / "out.mcap"
+    assert run("recognise", lane_log, "-o", out, "--model", path) == 0
+    found = read_log(out).detections
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
 
 
@@ -198,38 +153,22 @@ def test_label_ends_with_a_command_that_has_the_options_that_it_was_given(
     monkeypatch.setattr("sonar_graph.cli.label.serve", lambda *_, **__: None)
     designs = Path(devices.__file__).with_name("default_landmarks.toml")
     labels = tmp_path / "labels.json"
-    said = " ".join(
-        "".join(
-            reply(
-                0, "label", lane_log, "-o", labels, "--designs", designs, "--no-browser"
-            )
-        ).split()
-    )
-    assert (
-        f"Next: sonar-graph calibrate {lane_log} --labels {labels} --designs {designs} -o model.json"
-        in said
-    )
+    words = lane_log, "-o", labels, "--designs", designs, "--no-browser"
+    said = " ".join("".join(reply(0, "label", *words)).split())
+    options = f"--labels {labels} --designs {designs} -o model.json"
+    assert f"Next: sonar-graph calibrate {lane_log} {options}" in said
 
 
 def test_designs_of_ones_own_and_settings_need_no_code(short_log, run, tmp_path, reply):
-    (tmp_path / "mine.toml").write_text(DESIGNS)
-    words = "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml"
+    designs = tmp_path / "mine.toml"
+    designs.write_text(DESIGNS)
+    out = tmp_path / "out.mcap"
+    words = "recognise", short_log, "-o", out
     unknown = "Warning: the log has landmarks 1, 2, 3, of which there is no design"
-    assert unknown in reply(0, "recognise", short_log, *words).out
-    found = read_log(tmp_path / "out.mcap").detections
-    assert np.unique(found.candidate_ids).tolist() == [4]
-    assert (
-        run(
-            "recognise",
-            short_log,
-            "-o",
-            tmp_path / "none.mcap",
-            "--set",
-            "least_frames=10000",
-        )
-        == 0
-    )
-    assert read_log(tmp_path / "none.mcap").detections is None
+    assert unknown in reply(0, *words, "--designs", designs).out
+    assert np.unique(read_log(out).detections.candidate_ids).tolist() == [4]
+    assert run(*words, "--set", "least_frames=10000") == 0
+    assert read_log(out).detections is None
 
 
 def test_images_alone_are_recognised_and_what_is_lost_is_said(
@@ -245,50 +184,33 @@ def test_images_alone_are_recognised_and_what_is_lost_is_said(
     words = "recognise", log, "-o", out
     lacking = "no IMU and no DVL in the log; leave --motion out"
     assert lacking in reply(2, *words, "--motion", "navigation").err
-    (tmp_path / "over.json").write_text(
-        lane.sequence.calibration.model_dump_json(exclude_unset=True)
-    )
-    for more, said in (
-        (
-            (),
-            "Warning: height and tilt are not known: landmarks are compared in the plane of the image",
-        ),
-        (
-            ("--motion", "fixed"),
-            "Without navigation: motion none: the sonar is taken to be at rest",
-        ),
-        (
-            ("--calibration", tmp_path / "over.json"),
-            "Without navigation: height and tilt are taken to stay those of the calibration's",
-        ),
+    given = tmp_path / "over.json"
+    given.write_text(lane.sequence.calibration.model_dump_json(exclude_unset=True))
+    plane = "landmarks are compared in the plane of the image"
+    none = "Without navigation: motion none: the sonar is taken to be at rest"
+    kept = "height and tilt are taken to stay those of the calibration's"
+    for said, *more in (
+        (f"Warning: height and tilt are not known: {plane}",),
+        (none, "--motion", "fixed"),
+        (f"Without navigation: {kept}", "--calibration", given),
     ):
-        lines = reply(0, *words, *more).out
-        assert said in lines
-        assert "no estimator can run on the images alone; `sonar-graph join`" in lines
-    assert (
-        f"sonar-graph recognise {log} -o recognised.mcap"
-        in reply(3, "inspect", log).out
-    )
-    with out.open("rb") as stream:
-        topics = {
-            channel.topic for _, channel, _ in make_reader(stream).iter_messages()
-        }
-    assert topics == {TOPIC, "/sonar/landmarks"}
+        told = reply(0, *words, *more).out
+        assert said in told
+        assert "no estimator can run on the images alone; `sonar-graph join`" in told
+    advice = f"sonar-graph recognise {log} -o recognised.mcap"
+    assert advice in reply(3, "inspect", log).out
+    assert topics_of(out) == {TOPIC, "/sonar/landmarks"}
 
 
 def test_a_page_of_the_tracks_is_written_and_replaces_only_its_own(
     short_log, tmp_path, reply
 ):
     page = tmp_path / "page.html"
-    out = tmp_path / "out.mcap"
     page.write_text("mine")
-    assert (
-        "page.html: exists, and sonar-graph did not write it"
-        in reply(2, "recognise", short_log, "-o", out, "--report", page).err
-    )
+    out = tmp_path / "out.mcap"
+    words = "recognise", short_log, "-o", out, "--report", page
+    refusal = "page.html: exists, and sonar-graph did not write it"
+    assert refusal in reply(2, *words).err
     for more in (("--overwrite",), ()):
-        assert (
-            f"Page: {page}"
-            in reply(0, "recognise", short_log, "-o", out, "--report", page, *more).out
-        )
+        assert f"Page: {page}" in reply(0, *words, *more).out
         assert 'id="track-0"' in page.read_text()

@@ -38,15 +38,6 @@ def log(tmp_path) -> Path:
     return tmp_path / "log.mcap"
 
 
-def cropped(frame: SonarFrames, bins: int) -> SonarFrames:
-    return SonarFrames(
-        frame.stamps_ns,
-        frame.intensity[:, :, :bins],
-        frame.ranges_m[:bins],
-        frame.azimuths_rad,
-    )
-
-
 def sure(found: Recognition) -> set[int]:
     ids, probability = found.detections.most_probable()
     return set(ids[probability > 0.9].tolist())
@@ -58,24 +49,26 @@ def plain(lane, tmp_path_factory) -> Recognition:
 
 
 def test_two_windows_in_turn_are_both_used(lane, log, plain):
-    frames = [cropped(f, 450) if k % 2 else f for k, f in enumerate(frames_of(lane))]
+    frames = frames_of(lane)
+    for k in range(1, COUNT, 2):
+        image, ranges_m = frames[k].intensity, frames[k].ranges_m
+        cropped = {"intensity": image[:, :, :450], "ranges_m": ranges_m[:450]}
+        frames[k] = replace(frames[k], **cropped)
     found = recognised(lane, log, frames)
     assert sum("not used" in reason for _, reason in found.warnings) == 1
     assert sure(found) == sure(plain)
     stamps = [int(frame.stamps_ns[0]) for frame in frames]
-    assert {
-        stamps.index(stamp) % 2 for stamp in found.detections.stamps_ns.tolist()
-    } == {0, 1}
+    used = found.detections.stamps_ns.tolist()
+    assert {stamps.index(stamp) % 2 for stamp in used} == {0, 1}
 
 
 def test_a_leap_of_the_clock_costs_one_frame(lane, log, plain):
     frames = frames_of(lane)
     recorded_ns = frames[30].stamps_ns
-    frames[30] = replace(frames[30], stamps_ns=recorded_ns + 10 * SECONDS)
+    stamps_ns = recorded_ns + 10 * SECONDS
+    frames[30] = replace(frames[30], stamps_ns=stamps_ns)
     found = recognised(lane, log, frames, log_times_ns=recorded_ns)
-    assert found.warnings == [
-        (int(frames[30].stamps_ns[0]), f"frame not used: {LEAPT}")
-    ]
+    assert found.warnings == [(int(stamps_ns[0]), f"frame not used: {LEAPT}")]
     assert len(found.detections) >= len(plain.detections) - 3
 
 
@@ -90,9 +83,8 @@ def test_bad_frames_are_never_drawn(lane, log):
 
 
 def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, log):
-    write_log(
-        log, lane.sequence, [sonar_image_messages(TOPIC, f) for f in frames_of(lane)]
-    )
+    messages = [sonar_image_messages(TOPIC, frame) for frame in frames_of(lane)]
+    write_log(log, lane.sequence, messages)
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
@@ -105,11 +97,8 @@ def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, log
 
 
 def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, log):
-    bare = replace(
-        lane.sequence,
-        depth=None,
-        calibration=lane.sequence.calibration.model_copy(update={"floor": None}),
-    )
+    calibration = lane.sequence.calibration.model_copy(update={"floor": None})
+    bare = replace(lane.sequence, depth=None, calibration=calibration)
     found = recognised(replace(lane, sequence=bare), log)
     assert found.frames == COUNT
     assert found.warnings == []

@@ -61,13 +61,6 @@ class Interrupts(DeadReckoning):
     def process(self, measurements):
         raise KeyboardInterrupt("of its own")
 """
-CLASSES = (
-    "Meddling",
-    "Wording",
-    "Exits",
-    "Aborts",
-    "Interrupts",
-)
 
 
 @pytest.fixture
@@ -78,10 +71,10 @@ def plugin(tmp_path, monkeypatch) -> None:
     (about / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n"
     )
-    points = [f"their-{name.lower()} = theirs:{name}" for name in CLASSES]
-    (about / "entry_points.txt").write_text(
-        "\n".join(["[sonar_graph.estimators]", *points, ""])
-    )
+    names = re.findall(r"class (\w+)\(DeadReckoning", PLUGIN)
+    points = [f"their-{name.lower()} = theirs:{name}" for name in names]
+    text = "\n".join(["[sonar_graph.estimators]", *points, ""])
+    (about / "entry_points.txt").write_text(text)
     (tmp_path / "theirs.py").write_text(PLUGIN)
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -92,49 +85,43 @@ def mission():
 
 
 def state() -> tuple[object, ...]:
-    return (
-        np.sqrt,
-        np.linalg.norm,
-        np.geterr(),
-        sys.getrecursionlimit(),
-        Path.cwd(),
-        dict(os.environ),
-    )
+    """What `meddle` would change."""
+    of_numpy = np.sqrt, np.linalg.norm, np.geterr()
+    return *of_numpy, sys.getrecursionlimit(), Path.cwd(), dict(os.environ)
 
 
 def test_an_estimator_cannot_change_another_s_process(plugin, mission):
-    own = ["dead-reckoning", "ekf-slam"]
-    alone = compare(mission, own)
+    first, second = "dead-reckoning", "ekf-slam"
+    alone = compare(mission, [first, second])
     before = state()
-    together = compare(mission, [own[0], "their-meddling", own[1]])
+    together = compare(mission, [first, "their-meddling", second])
     assert state() == before
     assert "theirs" not in sys.modules
-    runs = {run.estimator: run for run in together.runs}
-    for run in alone.runs:
-        other = runs[run.estimator]
-        for one, two in ((run.causal, other.causal), (run.smoothed, other.smoothed)):
+    own, meddling, other = together.runs
+    assert meddling.status == "ok"
+    for run, again in zip(alone.runs, (own, other), strict=True):
+        for path in ("causal", "smoothed"):
+            paths = [getattr(one, path) for one in (run, again)]
             for name in ("stamps_ns", "positions", "quaternions_xyzw", "covariances"):
-                assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+                one, two = (getattr(path, name).tobytes() for path in paths)
+                assert one == two
 
 
 def test_a_process_of_its_own_gives_the_same_numbers(plugin, mission, monkeypatch):
-    steps = []
-    apart = run_estimator(
-        mission, "dead-reckoning", progress=lambda *step: steps.append(step)
-    )
+    def ran():
+        steps = []
+        told = {"progress": lambda *step: steps.append(step)}
+        run = run_estimator(mission, "dead-reckoning", **told)
+        return run.causal.positions.tobytes(), steps
+
+    here = ran()
     monkeypatch.setattr(
         "sonar_graph.estimator.DISTRIBUTION", "another name of this package"
     )
     assert is_foreign("dead-reckoning")
-    told = []
-    here = run_estimator(
-        mission, "dead-reckoning", progress=lambda *step: told.append(step)
-    )
-    assert here.causal.positions.tobytes() == apart.causal.positions.tobytes()
-    assert told == steps
-    with pytest.raises(
-        EstimatorError, match=r"settings of dead-reckoning: \w+.* no such"
-    ):
+    assert ran() == here
+    told = r"settings of dead-reckoning: \w+.* no such"
+    with pytest.raises(EstimatorError, match=told):
         check_request("dead-reckoning", {"wrong": 1})
 
 
@@ -166,7 +153,7 @@ def test_a_process_that_ends_by_itself_is_named_with_its_code():
 
 @pytest.mark.parametrize("failure", [RuntimeError, None])
 def test_an_interrupt_is_no_failure_of_the_estimator(mission, monkeypatch, failure):
-    def swallow(*_: object) -> None:
+    def swallow(*_):
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)

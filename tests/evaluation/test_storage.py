@@ -1,7 +1,7 @@
 import json
 import re
 import zipfile
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,21 @@ from sonar_graph.evaluation import (
     write_comparison,
 )
 from sonar_graph.files import COMPARISON, replacing, result_written
+from sonar_graph.states import Refusal, RefusedRow
+from tests.synthetic import late, outlier, with_run
 
 from .conftest import Offset, straight_sequence
 
 
 @pytest.fixture
 def comparison(install) -> Comparison:
-    """One run that went well, one that failed."""
+    """One run that went well but for refused rows, one that failed."""
     install(other=Offset)
-    return compare(
-        straight_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}}
-    )
+    settings = {"offset": {"offset_m": 0.4}}
+    found = compare(straight_sequence(), ["offset", "broken"], settings)
+    rows = [outlier(k * 10**9, 50.0 + k) for k in range(8)] + [late(3)]
+    said = {"refused": rows, "withheld": ["landmark 3; open: z"]}
+    return with_run(found, replace(found.runs[0], **said))
 
 
 @pytest.fixture
@@ -41,7 +45,7 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
     """Equal all the way down; arrays exactly, NaN equal to NaN."""
     if is_dataclass(left):
         left, right = vars(left), vars(right)
-    if isinstance(left, list):
+    if isinstance(left, (list, RefusedRow)):
         left, right = dict(enumerate(left)), dict(enumerate(right))
     if isinstance(left, dict):
         assert list(left) == list(right), where
@@ -57,15 +61,14 @@ def test_reading_returns_what_was_written(comparison, folder):
     restored = read_comparison(str(folder))
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
         assert_same(getattr(comparison, name), getattr(restored, name), name)
-    names = "name notes truth true_landmarks detections start_ns end_ns"
+    names = "name notes truth true_landmarks detections start_ns end_ns calibration"
     for name in names.split():
         values = [getattr(one.sequence, name) for one in (comparison, restored)]
         assert_same(*values, name)
-    assert restored.sequence.calibration == comparison.sequence.calibration
     assert isinstance(restored.sequence.calibration, Calibration)
 
 
-def test_json_is_strict_and_has_units_and_protocol(folder):
+def test_json_is_strict_and_has_units_protocol_and_counts(folder):
     text = (folder / "comparison.json").read_text("utf-8")
     assert not re.search(r"\b(NaN|Infinity)\b", text)
     runs = json.loads(text)["runs"]
@@ -76,20 +79,23 @@ def test_json_is_strict_and_has_units_and_protocol(folder):
     assert runs["offset"]["params"]["offset_m"] == 0.4
     assert runs["broken"]["status"] == "failed"
     assert "diverged" in runs["broken"]["reason"]
+    many, one = runs["offset"]["refused"]
+    assert (many["sensor"], many["reason"]) == ("dvl", Refusal.OUTLIER.value)
+    assert (many["count"], many["first_ns"], many["last_ns"]) == (8, 0, 7 * 10**9)
+    assert many["least_and_largest_distance"] == [50.0, 57.0]
+    assert one["least_and_largest_distance"] is None
 
 
-def test_a_result_folder_is_readable_without_this_package(
-    folder,
-):
+def test_a_result_folder_is_readable_without_this_package(folder):
     good = folder / "runs" / "offset"
-    failed = folder / "runs" / "broken"
+    names = {
+        path.relative_to(good.parent).as_posix() for path in good.parent.glob("*/*")
+    }
     files = "causal.tum", "landmarks.csv", "series.npz", "trajectory.tum"
-    assert tuple(sorted(path.name for path in good.iterdir())) == files
-    assert [path.name for path in failed.iterdir()] == ["series.npz"]
-    causal = file_interface.read_tum_trajectory_file(good / "causal.tum")
-    smoothed = file_interface.read_tum_trajectory_file(good / "trajectory.tum")
-    np.testing.assert_allclose(causal.positions_xyz[:, 1], 0.4)
-    np.testing.assert_allclose(smoothed.positions_xyz[:, 1], 0.2)
+    assert names == {"broken/series.npz", *(f"offset/{name}" for name in files)}
+    for name, offset_m in (("causal.tum", 0.4), ("trajectory.tum", 0.2)):
+        path = file_interface.read_tum_trajectory_file(good / name)
+        np.testing.assert_allclose(path.positions_xyz[:, 1], offset_m)
     landmarks = (good / "landmarks.csv").read_text("utf-8").splitlines()
     assert [row.split(",")[0] for row in landmarks] == ["id", "7", "9", "20"]
     for path in folder.rglob("*.npz"):

@@ -5,26 +5,20 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from sonar_graph import read_log, run_estimator, write_log
 from sonar_graph.live import (
-    LiveOptions,
-    LiveRun,
     Publisher,
-    definition_of,
     inbox,
     open_session,
     play_messages,
-    subscribe,
 )
-from sonar_graph.live.outlets import zenoh_outlet
-from sonar_graph.logs import LiveRecord
 from sonar_graph.simulation import MissionOptions, simulate_mission
-from tests.live.traffic import free_endpoint, messages_of
+from tests.live.traffic import free_endpoint, lived, messages_of
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.slow
@@ -69,45 +63,17 @@ def robot(endpoint, messages, wait=lambda _: None):
     return threading.Thread(target=play_messages, args=sent, daemon=True), session
 
 
-def lived(folder, endpoint, sender, said):
-    """The outcome of a live run on what a robot sends, and its counts."""
-    robot, router = sender
-    options = LiveOptions("ekf-slam", lateness_s=1.0)
-    with ExitStack() as stack:
-        session = stack.enter_context(open_session([endpoint]))
-        record = stack.enter_context(LiveRecord(folder / "record.mcap"))
-        outlets = [zenoh_outlet(session, 0)]
-        run = stack.enter_context(
-            LiveRun(record, definition_of, options, outlets, said.append)
-        )
-        subscriptions = subscribe(session, 0, run.accept)
-        time.sleep(0.5)
-        robot.start()
-        last_s = time.monotonic() + 90
-        while robot.is_alive() and time.monotonic() < last_s:
-            run.turn()
-        until_s = time.monotonic() + 2.0
-        while time.monotonic() < until_s:
-            run.turn()
-        for one in subscriptions:
-            one.undeclare()
-        outcome = run.finish()
-        counts = run.counts()
-    router.close()
-    return outcome, counts
-
-
-def assert_equals_log(outcome, folder, at_least):
+def assert_equals_log(outcome, folder):
     log = read_log(folder / "record.mcap")
     again = run_estimator(log, "ekf-slam", instants_ns=log.instants(10.0)).causal
     mine = outcome.causal
-    common, ours, theirs = np.intersect1d(
-        mine.stamps_ns, again.stamps_ns, return_indices=True
-    )
-    assert len(common) >= at_least
+    stamps_ns = (mine.stamps_ns, again.stamps_ns)
+    common, *rows = np.intersect1d(*stamps_ns, return_indices=True)
+    assert len(common) >= 150
     for name in ("positions", "quaternions_xyzw", "covariances"):
-        one, other = getattr(mine, name)[ours], getattr(again, name)[theirs]
-        assert one.tobytes() == other.tobytes(), name
+        both = zip((mine, again), rows, strict=True)
+        one, other = (getattr(path, name)[at].tobytes() for path, at in both)
+        assert one == other, name
 
 
 def at_s(messages, message):
@@ -118,12 +84,10 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
     tmp_path, endpoint, messages, monkeypatch
 ):
     monkeypatch.setattr(inbox, "SILENT_S", 0.5)
-    said = []
+    last_s = time.monotonic() + 60
 
     def is_gone(message):
         return message.topic == "/dvl/data" and 8 < at_s(messages, message) < 14
-
-    last_s = time.monotonic() + 60
 
     def wait(message):
         """A loaded machine takes longer to notice: the gap lasts until it has."""
@@ -133,10 +97,13 @@ def test_a_doppler_log_that_stops_and_returns_is_named_both_times(
             time.sleep(0.05)
 
     left = [message for message in messages if not is_gone(message)]
-    outcome, counts = lived(tmp_path, endpoint, robot(endpoint, left, wait), said)
+    sender, router = robot(endpoint, left, wait)
+    said = []
+    outcome, counts = lived(tmp_path, endpoint, sender, said)
+    router.close()
     assert any(line.startswith("/dvl/data: nothing since") for line in said)
     assert not counts["lost"]
-    assert_equals_log(outcome, tmp_path, 150)
+    assert_equals_log(outcome, tmp_path)
 
 
 def test_a_burst_at_ten_times_the_pace_beside_a_stalled_viewer_loses_nothing(
@@ -149,7 +116,7 @@ def test_a_burst_at_ten_times_the_pace_beside_a_stalled_viewer_loses_nothing(
     for message in messages:
         due_s = np.interp(at_s(messages, message), (0.0, 8.0, 14.0, 25.4), burst_s)
         come.append(message._replace(arrival_ns=first_ns + int(due_s * 1e9)))
-    sender = robot(endpoint, come)
+    sender, router = robot(endpoint, come)
     arrived = []
     with stalled(endpoint), open_session([endpoint]) as session:
         subscriber = session.declare_subscriber(
@@ -157,11 +124,12 @@ def test_a_burst_at_ten_times_the_pace_beside_a_stalled_viewer_loses_nothing(
         )
         outcome, counts = lived(tmp_path, endpoint, sender, [])
         subscriber.undeclare()
+    router.close()
     assert not counts["lost"]
     assert sum(counts["received"].values()) == len(messages)
     assert len(arrived) > 500
     assert max(np.diff(arrived)) < 2.0
-    assert_equals_log(outcome, tmp_path, 150)
+    assert_equals_log(outcome, tmp_path)
 
 
 @contextmanager

@@ -1,13 +1,24 @@
 """Messages of a log as they would arrive over a network that delays them."""
 
 import socket
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 from mcap.reader import make_reader
 
 from sonar_graph import read_log
-from sonar_graph.live import Engine, LiveOptions, Message, definition_of
+from sonar_graph.live import (
+    Engine,
+    LiveOptions,
+    LiveRun,
+    Message,
+    definition_of,
+    open_session,
+    subscribe,
+)
+from sonar_graph.live.outlets import zenoh_outlet
 from sonar_graph.logs import LiveRecord
 from sonar_graph.measurements import BLOCKS
 
@@ -59,6 +70,30 @@ def live(path: Path, messages: list[Message], **options):
                 assert len(steps) < 1000, "steps without end"
         steps += engine.finish()
     return engine, steps
+
+
+def lived(folder: Path, endpoint: str, sender: threading.Thread, said, **options):
+    """The outcome of a live run on what a thread sends, and its counts."""
+    made = LiveOptions("ekf-slam", lateness_s=1.0, **options)
+    with (
+        open_session([endpoint]) as session,
+        LiveRecord(folder / "record.mcap") as record,
+        LiveRun(
+            record, definition_of, made, [zenoh_outlet(session, 0)], said.append
+        ) as run,
+    ):
+        subscriptions = subscribe(session, 0, run.accept)
+        time.sleep(0.5)
+        sender.start()
+        last_s = time.monotonic() + 90
+        while sender.is_alive() and time.monotonic() < last_s:
+            run.turn()
+        until_s = time.monotonic() + 2.0
+        while time.monotonic() < until_s:
+            run.turn()
+        for one in subscriptions:
+            one.undeclare()
+        return run.finish(), run.counts()
 
 
 def assert_same_steps(mine, theirs):
