@@ -420,7 +420,7 @@ class SensorCheck:
         unbiased, _ = self.find_bias(tilt)
         as_before = replace(unbiased, truth=alone.truth)
         self.reference = list(reference_faults(as_before, self.config))
-        if not self.reference:
+        if not any(fault.grave for fault in self.reference):
             self.right = alone
 
     def find_bias(self, tilt: StartTilt) -> tuple[Sequence, Estimates3D]:

@@ -127,15 +127,15 @@ def noise_of_positions_m(positions: Floats) -> float:
     """Noise of true positions, shape (n, 3), by second differences, those of white noise being sqrt(6) times as large."""
     bent = np.diff(positions, n=2, axis=0)
     if not len(bent):
-        return LEAST_NOISE_M
-    sigma_m = 1.4826 * np.median(np.abs(bent), axis=0).max() / np.sqrt(6.0)
-    return max(float(sigma_m), LEAST_NOISE_M)
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(bent), axis=0).max()) / np.sqrt(6.0)
 
 
 def reference_noise_m(as_sensed: Sequence) -> float:
     """Noise of true positions that take the place of position fixes."""
     assert as_sensed.positions is not None
-    return noise_of_positions_m(as_sensed.positions.position_m)
+    noise_m = noise_of_positions_m(as_sensed.positions.position_m)
+    return max(noise_m, LEAST_NOISE_M)
 
 
 def true_path_match(as_sensed: Sequence, motion: BodyMotion) -> Match | None:
@@ -300,7 +300,9 @@ def arm_or_delay(
 
 def wild_positions(positions: Floats) -> Iterator[Finding]:
     """Single true positions, shape (n, 3), far from those before and after."""
-    is_wild = are_wild(positions, WILD_SIGMAS * noise_of_positions_m(positions))
+    is_wild = are_wild(
+        positions, WILD_SIGMAS * max(noise_of_positions_m(positions), LEAST_NOISE_M)
+    )
     if not is_wild.any() or is_wild.mean() > MOST_WILD:
         return
     rows = np.arange(len(positions), dtype=np.float64)

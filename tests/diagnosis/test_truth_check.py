@@ -15,7 +15,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import Trajectory
 
-from .runs import grave, names, started
+from .runs import grave, level_vehicle, names, started
 
 BASIN = simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1))
 UNKNOWN = replace(BASIN, truth=None)
@@ -107,6 +107,53 @@ def test_a_truth_that_the_sensors_contradict_is_named_with_its_line(fault):
         "reference"
     ]
     assert line in found[0].line
+
+
+def driven(speed_m_s: Floats, yaw_rate: Floats) -> Sequence:
+    """A level drive at 50 Hz with its exact truth at 10 Hz."""
+    velocity = np.outer(speed_m_s, [1.0, 0.0, 0.0])
+    run = level_vehicle(velocity, yaw_rate, seed=3)
+    yaw_rad = np.append(0.0, np.cumsum(yaw_rate)[:-1] / 50.0)
+    ahead = np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)])
+    steps_m = speed_m_s[:, None] * ahead / 50.0
+    positions = np.vstack([np.zeros(3), np.cumsum(steps_m, axis=0)[:-1]])
+    turns = Rotation.from_euler("z", yaw_rad[:, None]).as_quat()
+    rows = slice(None, None, 5)
+    truth = Trajectory.without_covariances(
+        run.imu.stamps_ns[rows], positions[rows], turns[rows]
+    )
+    return replace(run, truth=truth)
+
+
+def test_a_vehicle_that_rests_gives_its_right_truth_no_arm():
+    t = np.arange(0.0, 240.0, 0.02)
+    moves = np.clip(np.abs(t - 130.0) - 65.0, 0.0, 3.0) / 3.0
+    run = driven(0.4 * moves, 0.25 * moves * np.sin(0.11 * t))
+    assert grave(run) == []
+
+
+def test_a_long_way_is_compared_with_another_clock_too():
+    t = np.arange(0.0, 240.0, 0.02)
+    run = driven(np.full_like(t, 1.2), 0.04 * np.sin(0.03 * t) + 0.02)
+    late = replace(run.truth, stamps_ns=run.truth.stamps_ns + 37 * NS_PER_S)
+    (found,) = grave(replace(run, truth=late))
+    assert found.estimate.value == pytest.approx(37.0, abs=0.1)
+
+
+def test_orientations_of_another_time_are_orientations_of_something_else():
+    t = np.arange(0.0, 240.0, 0.02)
+    run = driven(np.full_like(t, 0.5), 0.15 * np.sin(0.1 * t + 1e-3 * t**2))
+    late = np.roll(run.truth.quaternions_xyzw, 200, axis=0)
+    found, *_ = grave(replace(run, truth=turned(run.truth, late)))
+    assert found.quantity == "reference: turn over that of the gyros"
+
+
+def test_a_noisy_first_position_does_not_contradict_the_start():
+    truth = BASIN.truth.rows(np.arange(0, len(BASIN.truth), 25))
+    noise = np.random.default_rng(2).normal(0.0, 0.4, (len(truth), 3))
+    noise[:3] = [0.8, -0.6, 0.0]
+    positions = Trajectory.of_positions(truth.stamps_ns, truth.positions + noise)
+    assert grave(replace(BASIN, truth=positions)) == []
 
 
 @pytest.mark.parametrize("noise_m", [0.02, 0.3])
