@@ -43,6 +43,7 @@ from sonar_graph.diagnosis.findings import (
 from sonar_graph.diagnosis.motion_signals import BodyMotion
 from sonar_graph.diagnosis.signals import (
     FEWEST_ROWS,
+    LAGS_S,
     MOST_WILD,
     NO_LAG,
     Match,
@@ -290,8 +291,11 @@ def arm_or_delay(
             yield arm
         return
     late = replace(path, sigma=max(path.sigma, LEAST_LATE_M)).delay()
+    delay_s = abs(late.estimate.value)
+    # at the end of the lags that are tried it is none
+    is_found = late.acts and delay_s < LAGS_S[-1]
     # to two seconds orientations show it better
-    if late.acts and (turned is None or abs(late.estimate.value) > LATE_S):
+    if is_found and (turned is None or delay_s > LATE_S):
         yield replace(
             late,
             cause=f"{late.cause}, or it is of another point than the body's origin",
