@@ -57,15 +57,26 @@ SMOOTHERS = {
     for name, lag_s in (("everything kept", 1e6), ("three seconds kept", 3.1))
 }
 smoothers = pytest.mark.parametrize("params", SMOOTHERS.values(), ids=SMOOTHERS)
+each = pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+FILTERS = {
+    EkfSlam: EkfSlamParams(),
+    InvariantEkf: InvariantEkfParams(kernel_width=0.0),
+}
+"""Both filters, with Gaussian noise."""
 
 
 def run(
-    estimator: Estimator, sequence: Sequence, rate_hz: float = 1 / STEP_S
-) -> list[Estimate]:
+    kind: type[Estimator],
+    sequence: Sequence,
+    rate_hz: float = 1 / STEP_S,
+    params: Any = None,
+) -> tuple[Estimator, list[Estimate]]:
+    """The estimator after the sequence, and its estimates."""
+    estimator = kind(sequence.calibration, Odometry(sequence.calibration), params)
     answers = [
         estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))
     ]
-    return [answer for answer in answers if answer is not None]
+    return estimator, [answer for answer in answers if answer is not None]
 
 
 def difference(
@@ -76,43 +87,21 @@ def difference(
     poses = []
     covs = []
     for a, b in zip(one, other, strict=True):
-        poses.append(
-            np.abs(
-                a.world_T_body.inverse().compose(b.world_T_body).matrix() - np.eye(4)
-            ).max()
-        )
+        a_T_b = a.world_T_body.inverse().compose(b.world_T_body)
+        poses.append(np.abs(a_T_b.matrix() - np.eye(4)).max())
         sigma = np.sqrt(np.diag(b.covariance)[axes])
-        covs.append(
-            np.abs(
-                (a.covariance - b.covariance)[axes, axes] / np.outer(sigma, sigma)
-            ).max()
-        )
+        off = (a.covariance - b.covariance)[axes, axes] / np.outer(sigma, sigma)
+        covs.append(np.abs(off).max())
     return max(poses), max(covs)
-
-
-def made(
-    kind: type[Estimator], calibration: Calibration, params: Any = None
-) -> Estimator:
-    return kind(calibration, Odometry(calibration), params)
-
-
-def filters(calibration: Calibration) -> list[Estimator]:
-    """Both filters, with Gaussian noise."""
-    return [
-        made(EkfSlam, calibration, EkfSlamParams()),
-        made(InvariantEkf, calibration, InvariantEkfParams(kernel_width=0.0)),
-    ]
 
 
 @smoothers
 def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
     """At every node, with what was measured until then, along x, and in the map at the end: to 1e-6."""
     sequence, numbers = rail(NODES)
-    for estimator in (
-        *filters(sequence.calibration),
-        made(Isam2, sequence.calibration, params),
-    ):
-        for k, estimate in enumerate(run(estimator, sequence), 1):
+    for kind, own in (FILTERS | {Isam2: params}).items():
+        estimator, estimates = run(kind, sequence, params=own)
+        for k, estimate in enumerate(estimates, 1):
             mean, variance = numbers.solution(k + 1)
             assert estimate.world_T_body.translation()[0] == pytest.approx(
                 mean[f"x{k}"], abs=1e-6
@@ -152,31 +141,27 @@ def test_filter_and_smoother_agree_where_all_is_linear(params, with_fixes):
     An azimuth constrains y less from farther off, and filters do not re-linearise: 2e-6 of the variance of y.
     """
     sequence, _ = rail(NODES)
-    truth = run(filters(sequence.calibration)[0], sequence)
+    _, without = run(EkfSlam, sequence)
     fixes_ns = sequence.dvl.stamps_ns[1:-1] + NS_PER_S // 10
-    x = np.array(
-        [
-            [estimate.world_T_body.translation()[0] + 0.12, 0.0, 0.0]
-            for estimate in truth
-        ]
-    )[: len(fixes_ns)]
-    fixes = PositionFixes(fixes_ns, x, np.tile(0.1 * np.eye(3), (len(fixes_ns), 1, 1)))
+    x = [estimate.world_T_body.translation()[0] + 0.12 for estimate in without]
+    places = np.outer(x[: len(fixes_ns)], [1.0, 0.0, 0.0])
+    fixes = PositionFixes(
+        fixes_ns, places, np.tile(0.1 * np.eye(3), (len(places), 1, 1))
+    )
     aided = replace(sequence, positions=fixes) if with_fixes else sequence
-    three = *filters(sequence.calibration), made(Isam2, sequence.calibration, params)
-    ekf, invariant, smoother = (run(estimator, aided, 10) for estimator in three)
+    ekf, invariant, smoother = (
+        run(kind, aided, 10, own)[1]
+        for kind, own in (FILTERS | {Isam2: params}).items()
+    )
     for estimates in (ekf, invariant):
         assert max(difference(estimates, smoother, slice(3, 4))) < 1e-6
         assert difference(estimates, smoother, slice(3, 6))[1] < 1e-5
     if with_fixes:
-        assert (
-            difference(
-                ekf, run(filters(sequence.calibration)[0], sequence, 10), slice(3, 4)
-            )[1]
-            > 0.1
-        )
+        _, without = run(EkfSlam, sequence, 10)
+        assert difference(ekf, without, slice(3, 4))[1] > 0.1
 
 
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+@each
 def test_headings_of_a_biased_compass_are_the_textbook_s_scalar_update(kind):
     """At rest: n of them have the variance ``bias^2 + sigma^2 / n``, and ``1 / P' = 1 / P + 1 / R``."""
     n = 21
@@ -194,7 +179,7 @@ def test_headings_of_a_biased_compass_are_the_textbook_s_scalar_update(kind):
     at_rest = replace(
         sequence, calibration=known, dvl=still, heading=heading, detections=None
     )
-    estimate = run(made(kind, known), at_rest, 1.0)[-1]
+    estimate = run(kind, at_rest, 1.0)[1][-1]
     R = bias**2 + sigma**2 / n
     assert estimate.world_T_body.rotation().yaw() == pytest.approx(
         yaw_rad * prior**2 / (prior**2 + R), abs=1e-6
@@ -245,76 +230,60 @@ def _waves(t: Floats) -> Floats:
 
 def test_without_sightings_all_are_dead_reckoning():
     """Poses and whole covariances, at nodes and between them."""
-    sequence = winding()
-    reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
+    _, reckoned = run(DeadReckoning, winding(), 3.7)
     for kind in (EkfSlam, InvariantEkf, Isam2):
-        assert (
-            max(
-                difference(
-                    run(made(kind, sequence.calibration), sequence, 3.7), reckoned
-                )
-            )
-            < 1e-6
-        )
+        assert max(difference(run(kind, winding(), 3.7)[1], reckoned)) < 1e-6
 
 
 @pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
 def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind):
     """A constant, unobservable bias: unknown, and the same at all times."""
     sequence = winding(gyro_bias_sigma=2e-3)
-    reckoned = run(made(DeadReckoning, sequence.calibration), sequence, 3.7)
-    poses, covariances = difference(
-        run(made(kind, sequence.calibration), sequence, 3.7), reckoned
-    )
+    _, reckoned = run(DeadReckoning, sequence, 3.7)
+    poses, covariances = difference(run(kind, sequence, 3.7)[1], reckoned)
     assert poses < 1e-6
     assert covariances < 1e-3
-    unaware = run(made(DeadReckoning, winding().calibration), sequence, 3.7)
+    _, unaware = run(DeadReckoning, winding(), 3.7)
     assert difference(unaware, reckoned)[1] > 0.1
 
 
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+@each
 def test_rows_of_a_call_older_than_the_newest_are_used_or_named(kind):
     """Rows of a sensor come 2 s late, in a call that ends before the one before: a fix counts, the others cannot."""
     sequence, _ = rail(NODES)
-    estimator = made(kind, sequence.calibration)
-    others = made(kind, sequence.calibration)
-    run(estimator, sequence), run(others, sequence)
+    estimator, _ = run(kind, sequence)
+    others, _ = run(kind, sequence)
     end_ns = sequence.end_ns
     late_ns = np.array([end_ns - 3 * NS_PER_S, end_ns - 2 * NS_PER_S])
-    z_m = np.zeros(2)
-    yaw_rad = np.zeros(2)
+    zero = np.zeros(2)
     sigma = np.full(2, 0.01)
     late = Measurements(
         int(late_ns[-1]),
-        depth=Depth(late_ns, z_m, sigma**2),
-        heading=Heading(late_ns, yaw_rad, sigma),
+        depth=Depth(late_ns, zero, sigma**2),
+        heading=Heading(late_ns, zero, sigma),
         positions=PositionFixes(
             late_ns, np.full((2, 3), 0.3), np.tile(1e-6 * np.eye(3), (2, 1, 1))
         ),
     )
     assert estimator.process(late) is None
-    named = [(row.sensor, row.stamp_ns, row.reason) for row in estimator.refused_rows()]
+    named, before = (
+        [(row.sensor, row.stamp_ns, row.reason) for row in one.refused_rows()]
+        for one in (estimator, others)
+    )
     expected = [
         (sensor, int(t), Refusal.LATE)
         for sensor in ("depth", "heading")
         for t in late_ns
     ]
-    assert sorted(named) == sorted(
-        [*((r.sensor, r.stamp_ns, r.reason) for r in others.refused_rows()), *expected]
+    assert sorted(named) == sorted([*before, *expected])
+    after, without = (
+        one.process(Measurements(end_ns + 1)).world_T_body.translation()
+        for one in (estimator, others)
     )
-    asked = Measurements(end_ns + 1)
-    (after,), (without,) = (
-        [e] for e in (estimator.process(asked), others.process(asked))
-    )
-    assert (
-        np.linalg.norm(
-            after.world_T_body.translation() - without.world_T_body.translation()
-        )
-        > 0.01
-    )
+    assert np.linalg.norm(after - without) > 0.01
 
 
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+@each
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [("heading", "headings contradict its yaw"), ("positions", "position fixes")],
@@ -336,8 +305,8 @@ def test_headings_or_fixes_that_contradict_the_estimate_are_counted(kind, wrong,
         values[::every] += off
         given = replace(world, calibration=known, detections=None)
         given = replace(given, heading=None, positions=None)
-        estimator = made(kind, known)
-        run(estimator, replace(given, **{wrong: replace(rows, **{column: values})}))
+        values_off = {wrong: replace(rows, **{column: values})}
+        estimator, _ = run(kind, replace(given, **values_off))
         told = [line for line in estimator.withheld() if said in line]
         assert bool(told) == is_told, (sigma, every, estimator.withheld())
         if told:
@@ -345,50 +314,36 @@ def test_headings_or_fixes_that_contradict_the_estimate_are_counted(kind, wrong,
             assert 0.8 * judged < count <= judged <= len(rows)
 
 
+AT_NS = T0_NS + 5 * NS_PER_S
 NO_ROWS = {
-    "sigma of more than a turn": Heading(np.array([0]), np.zeros(1), np.full(1, 1e200)),
-    "more turns than a double keeps": Heading(
-        np.array([0]), np.full(1, 1e300), np.full(1, 0.01)
-    ),
-    "beyond the Earth": PositionFixes(
-        np.array([0]), np.full((1, 3), 1e12), np.eye(3)[None]
-    ),
+    "sigma of more than a turn": Heading([AT_NS], [0.0], [1e200]),
+    "more turns than a double keeps": Heading([AT_NS], [1e300], [0.01]),
+    "beyond the Earth": PositionFixes([AT_NS], [[1e12] * 3], [np.eye(3)]),
     "beyond everything": PositionFixes(
-        np.array([0]), np.full((1, 3), 1e200), np.full((1, 3, 3), np.nan)
+        [AT_NS], [[1e200] * 3], np.full((1, 3, 3), np.nan)
     ),
-    "sigma beyond the Earth": PositionFixes(
-        np.array([0]), np.zeros((1, 3)), 1e300 * np.eye(3)[None]
-    ),
+    "sigma beyond the Earth": PositionFixes([AT_NS], [[0.0] * 3], [1e300 * np.eye(3)]),
 }
 
 
-@pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf, Isam2])
+@each
 @pytest.mark.parametrize("row", NO_ROWS.values(), ids=NO_ROWS)
 def test_an_impossible_heading_or_fix_is_named_and_changes_nothing(kind, row):
     sequence, _ = rail(NODES)
-    at_ns = T0_NS + 5 * NS_PER_S
     sensor = "heading" if isinstance(row, Heading) else "positions"
-    estimator = made(kind, sequence.calibration)
-    others = made(kind, sequence.calibration)
-    estimates = run(
-        estimator,
-        replace(sequence, **{sensor: replace(row, stamps_ns=np.array([at_ns]))}),
-    )
+    estimator, estimates = run(kind, replace(sequence, **{sensor: row}))
     assert [refused[:3] for refused in estimator.refused_rows()] == [
-        (sensor, at_ns, Refusal.UNSOUND)
+        (sensor, AT_NS, Refusal.UNSOUND)
     ]
-    assert max(difference(estimates, run(others, sequence))) < 1e-9
+    assert max(difference(estimates, run(kind, sequence)[1])) < 1e-9
 
 
 def test_dead_reckoning_names_the_headings_and_fixes_that_it_does_not_use():
-    estimator = made(DeadReckoning, aided_world().calibration)
-    run(estimator, aided_world())
-    assert estimator.withheld() == [
-        "headings and position fixes of the log are not used"
-    ]
-    bare = made(DeadReckoning, winding().calibration)
-    run(bare, winding(), 3.7)
-    assert bare.withheld() == []
+    for sequence, told in (
+        (aided_world(), ["headings and position fixes of the log are not used"]),
+        (winding(), []),
+    ):
+        assert run(DeadReckoning, sequence, 3.7)[0].withheld() == told
 
 
 @pytest.mark.parametrize("kind", [DeadReckoning, EkfSlam, InvariantEkf, Isam2])
@@ -405,9 +360,7 @@ def test_the_start_pose_holds_where_the_imu_begins_between_two_velocities(kind):
     assert cut.start_ns == imu.stamps_ns[0]
     ends = []
     for rate_hz in (0.7, 5.0):
-        estimator = made(kind, calibration)
-        for window in cut.replay(cut.instants(rate_hz)):
-            estimator.process(window)
+        estimator, _ = run(kind, cut, rate_hz)
         ends.append(estimator.trajectory().at(imu.stamps_ns[1500:1501]).positions[0])
     truth = whole.true_poses.at(imu.stamps_ns[1500:1501]).positions[0]
     assert np.linalg.norm(ends[0] - truth) < 0.1

@@ -105,9 +105,6 @@ def test_the_start_s_covariance_is_of_roll_pitch_yaw_and_the_worlds_axes():
             "heading.sigma_rad: expected radians between 0 and 2π",
         ),
         ({"gravity_m_s2": 9810}, "gravity_m_s2: expected m/s² between 9 and 10.5"),
-        ({"imu": {"gyro_noise": 1}}, "imu.gyro_noise: there is no such field"),
-        ({"dvl": {"velocity_sigma_m_s": [1, 2]}}, "velocity_sigma_m_s: expected 3"),
-        ({"floor": {"z_m": -1.0}}, "floor.sigma_m: is missing"),
         ({"odometry_interpolation": "cubic"}, "odometry_interpolation"),
     ],
 )

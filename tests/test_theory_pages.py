@@ -12,36 +12,29 @@ import pytest
 THEORY = Path(__file__).parents[1] / "docs" / "theory"
 
 
-def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
-    picture = tmp_path / "recognition.png"
-    command = [sys.executable, "-W", "error", THEORY / "recognition.py", picture]
+def drawn(script: str, picture: Path) -> str:
+    """What a script prints; its picture has the shape of that which the page shows."""
+    command = [sys.executable, "-W", "error", THEORY / script, picture]
     done = subprocess.run(
         command, capture_output=True, text=True, encoding="utf-8", timeout=120
     )
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 13
+    shown = THEORY.parent / "images" / picture.name
+    new, old = (cv2.imread(os.fspath(path)) for path in (picture, shown))
+    assert new.shape == old.shape
+    return done.stdout
+
+
+def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
+    printed = drawn("recognition.py", tmp_path / "recognition.png")
+    assert len(printed.splitlines()) == 13
     page = (THEORY / "recognition.md").read_text(encoding="utf-8")
-    assert f"```\n{done.stdout}```\n" in page
-    drawn, shown = (
-        cv2.imread(os.fspath(path))
-        for path in (picture, THEORY.parent / "images" / "recognition.png")
-    )
-    assert drawn.shape == shown.shape
+    assert f"```\n{printed}```\n" in page
 
 
 @pytest.mark.slow
 def test_the_picture_of_scenes_is_what_its_script_draws(tmp_path):
-    picture = tmp_path / "scenes.png"
-    command = [sys.executable, "-W", "error", THEORY / "sonar_image.py", picture]
-    done = subprocess.run(
-        command, capture_output=True, text=True, encoding="utf-8", timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    drawn, shown = (
-        cv2.imread(os.fspath(path))
-        for path in (picture, THEORY.parent / "images" / "scenes.png")
-    )
-    assert drawn.shape == shown.shape
+    drawn("sonar_image.py", tmp_path / "scenes.png")
 
 
 def test_lines_quoted_on_the_way_from_the_paper_stand_in_the_files():

@@ -49,13 +49,23 @@ def output(folder: Path, *command: object, **environment: str) -> str:
     return done.stdout
 
 
-def run(name: str, folder: Path) -> str:
-    return output(folder, "python", "-W", "error", TUTORIALS / name)
+def python(folder: Path, *words: object) -> str:
+    """Output of a program, by its file or after ``-c``."""
+    return output(folder, "python", "-W", "error", *words)
+
+
+def page_of(name: str) -> str:
+    return (TUTORIALS / name).read_text(encoding="utf-8")
 
 
 def blocks(page: str, language: str) -> list[str]:
     """Blocks of a language on a page."""
     return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
+
+
+def commands(page: str) -> list[str]:
+    """What follows ``sonar-graph`` in the indented lines of a page."""
+    return commands(page)
 
 
 def number_after(text: str, pattern: str) -> float:
@@ -68,14 +78,11 @@ def number_after(text: str, pattern: str) -> float:
 def test_first_comparison_finds_the_landmarks_and_writes_a_page(
     tmp_path,
 ):
-    printed = run("01_first_comparison.py", tmp_path)
-    for landmark, true in TRUE_LANDMARKS.items():
-        row = re.search(
-            rf"^ +{landmark} +(-?[\d.]+) +(-?[\d.]+) +([\d.]+)$", printed, re.MULTILINE
-        )
-        assert row, printed
-        assert float(row[1]) == pytest.approx(true[0], abs=0.3)
-        assert float(row[2]) == pytest.approx(true[1], abs=0.3)
+    printed = python(tmp_path, TUTORIALS / "01_first_comparison.py")
+    number = r" +(-?[\d.]+)"
+    rows = re.findall(rf"^ +(\d){number * 2} +[\d.]+$", printed, re.MULTILINE)
+    assert_are_true(rows, 0.3)
+    assert len(rows) == 4
     page = (tmp_path / "comparison" / "report.html").read_text(encoding="utf-8")
     for name in ("isam2", "ekf-slam", "dead-reckoning"):
         assert number_after(printed, rf"\n{name}") < 0.5
@@ -85,7 +92,7 @@ def test_first_comparison_finds_the_landmarks_and_writes_a_page(
 
 @pytest.mark.slow
 def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
-    printed = run("02_library.py", tmp_path)
+    printed = python(tmp_path, TUTORIALS / "02_library.py")
     assert number_after(printed, r"in 10\.00 s:") == pytest.approx(0.39 * 10, abs=1.5)
     assert abs(number_after(printed, "turns it by")) == pytest.approx(
         1e-4 * 10, rel=0.01
@@ -93,7 +100,7 @@ def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
     assert "landmarks [1, 2, 3, 4]" in printed
     assert "120 poses" in printed or "119 poses" in printed
     assert 0 < abs(number_after(printed, r"landmarks \[1, 2\]:")) < 1
-    printed = run("05_preintegration.py", tmp_path)
+    printed = python(tmp_path, TUTORIALS / "05_preintegration.py")
     bias = number_after(printed, "about z:")
     sigma = number_after(printed, "±")
     assert abs(bias - 0.01) < 3.5 * sigma < 1e-3
@@ -105,7 +112,7 @@ def test_pages_on_the_library_and_preintegration_print_what_they_say(tmp_path):
 
 @pytest.mark.slow
 def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path):
-    printed = run("06_recogniser.py", tmp_path)
+    printed = python(tmp_path, TUTORIALS / "06_recogniser.py")
     last = printed[printed.rindex(": landmark 3 (") :]
     identity, certainty, range_m = re.search(
         r"landmark (\d) \(([\d.]+)\) at ([\d.]+)", last
@@ -123,9 +130,11 @@ def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path):
 
 @pytest.mark.slow
 def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path):
-    page = (TUTORIALS / "03_viewers.md").read_text(encoding="utf-8")
-    simulated = "simulate basin -o basin.mcap --duration-s 120 --laps 1"
-    for words in (simulated, "compare basin.mcap -o comparison --estimators isam2"):
+    page = page_of("03_viewers.md")
+    for words in (
+        "simulate basin -o basin.mcap --duration-s 120 --laps 1",
+        "compare basin.mcap -o comparison --estimators isam2",
+    ):
         output(tmp_path, "sonar-graph", *words.split())
     lines = re.findall(r"^    (evo_\w+ .*)$|`(evo_\w+ [^`]*)`", page, re.MULTILINE)
     assert len(lines) == 4
@@ -138,18 +147,22 @@ def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path):
         )
         assert "rmse" in printed or "poses" in printed
     (program,) = blocks(page, "python")
-    assert_landmarks_are_true(output(tmp_path, "python", "-c", program), 0.3)
+    assert_landmarks_are_true(python(tmp_path, "-c", program), 0.3)
 
 
 def assert_landmarks_are_true(printed: str, off_m: float) -> int:
     """The number of landmarks that are printed, each near the true one."""
     seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", printed)
-    assert seen
-    for landmark, x_m, y_m in seen:
-        assert (float(x_m), float(y_m)) == pytest.approx(
-            TRUE_LANDMARKS[int(landmark)], abs=off_m
-        )
+    assert_are_true(seen, off_m)
     return len(seen)
+
+
+def assert_are_true(seen: list[tuple[str, str, str]], off_m: float) -> None:
+    """Identities and places of landmarks."""
+    assert seen
+    for landmark, *place in seen:
+        true = TRUE_LANDMARKS[int(landmark)]
+        assert [float(x) for x in place] == pytest.approx(true, abs=off_m)
 
 
 def assert_is_simulated(found: Sequence, depth_scale: float | None = None) -> None:
@@ -167,7 +180,7 @@ def assert_is_simulated(found: Sequence, depth_scale: float | None = None) -> No
 
 @pytest.mark.slow
 def test_page_on_own_logs_has_programs_and_commands_that_work(tmp_path):
-    page = (TUTORIALS / "04_your_own_log.md").read_text(encoding="utf-8")
+    page = page_of("04_your_own_log.md")
     making, *others = blocks(page, "python")
     (configuration,) = blocks(page, "toml")
     store = get_typestore(Stores.ROS1_NOETIC)
@@ -177,11 +190,11 @@ def test_page_on_own_logs_has_programs_and_commands_that_work(tmp_path):
         )
         text = store.types["std_msgs/msg/String"]("hello")
         writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/String"))
-    output(tmp_path, "python", "-W", "error", "-c", making)
+    python(tmp_path, "-c", making)
     (tmp_path / "my_bag").mkdir()
     shutil.copy(tmp_path / "dive.mcap", tmp_path / "my_bag")
     printed = {}
-    for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+    for line in commands(page):
         words, _, target = line.partition(" > ")
         printed[words] = output(tmp_path, "sonar-graph", *words.split())
         if target:  # what is printed is a starting point; the page's own text is where the reader ends
@@ -199,14 +212,14 @@ def test_page_on_own_logs_has_programs_and_commands_that_work(tmp_path):
     rest = re.sub(expected, "", " ".join(second.split()))
     assert not re.findall("warning|not usable|left out", rest), rest
     for program in others:
-        output(tmp_path, "python", "-W", "error", "-c", program)
+        python(tmp_path, "-c", program)
     config = read_log_config(tmp_path / "dive.toml")
     assert_is_simulated(read_log(tmp_path / "dive.mcap", config=config))
 
 
 @pytest.mark.slow
 def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path):
-    page = (TUTORIALS / "07_batches.md").read_text(encoding="utf-8")
+    page = page_of("07_batches.md")
     (suite,) = blocks(page, "toml")
     (program,) = blocks(page, "python")
     commands = re.findall(r"^    (sonar-graph|python) (.*)$", page, re.MULTILINE)
@@ -222,7 +235,7 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path)
         module = ["-m", "sonar_graph"] if script == "sonar-graph" else []
         said = output(tmp_path, "python", *module, *words.split())
     assert "Gate: passed, without any test of errors, 8 runs" in said
-    printed = output(tmp_path, "python", "-c", program)
+    printed = python(tmp_path, "-c", program)
     assert len(printed.splitlines()) == 2 * 2 * 2
     assert printed.count("no kernel ok") == 4
     for cluster in blocks(page, "python cluster"):
@@ -230,7 +243,7 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path)
 
 
 def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path):
-    page = (TUTORIALS / "09_from_a_recording.md").read_text(encoding="utf-8")
+    page = page_of("09_from_a_recording.md")
     (tmp_path / "over.toml").write_text(
         textwrap.dedent(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
     )
@@ -245,7 +258,7 @@ def test_page_on_recordings_has_a_calibration_and_labels_that_are_read(tmp_path)
         label.id
         for label in read_labels(tmp_path / "labels.csv", Path("joined.mcap")).labels
     ] == [1, None]
-    for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+    for words in commands(page):
         command, *more = words.split()
         options = {option for option in more if option.startswith("--")}
         help_of_it = CliRunner().invoke(
@@ -289,13 +302,13 @@ def test_the_notebook_is_stored_without_output_and_runs(
 def test_page_on_tables_gives_the_simulated_run(
     tmp_path,
 ):
-    page = (TUTORIALS / "11_tables.md").read_text(encoding="utf-8")
+    page = page_of("11_tables.md")
     (making,) = blocks(page, "python")
     configuration, more, vehicle = blocks(page, "toml")
     parse_csv_config(tomllib.loads(configuration) | tomllib.loads(more), "the page")
     PartialCalibration.parse(tomllib.loads(vehicle), "the page")
-    output(tmp_path, "python", "-W", "error", "-c", making)
-    for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+    python(tmp_path, "-c", making)
+    for line in commands(page):
         words, _, target = line.partition(" > ")
         printed = output(tmp_path, "sonar-graph", *words.split())
         if target:  # the guess is that of the page, but for the axes of the IMU
@@ -317,15 +330,12 @@ def test_page_on_tables_gives_the_simulated_run(
 def test_programs_on_the_page_of_own_scripts_find_the_landmarks(
     tmp_path,
 ):
-    page = (TUTORIALS.parent / "howto" / "own_estimator.md").read_text("utf-8")
+    page = page_of("../howto/own_estimator.md")
     programs = blocks(page, "python")
     for program, most in zip(programs, (20, 30, 40), strict=True):
         assert len([line for line in program.splitlines() if line.strip()]) <= most
-    simulate = re.findall(r"^    sonar-graph (simulate .*)$", page, re.MULTILINE)[0]
-    output(tmp_path, "sonar-graph", *simulate.split())
-    scored, graph, compared = (
-        output(tmp_path, "python", "-W", "error", "-c", program) for program in programs
-    )
+    output(tmp_path, "sonar-graph", *commands(page)[0].split())
+    scored, graph, compared = (python(tmp_path, "-c", program) for program in programs)
     assert number_after(scored, "isam2: position error") < 0.1
     assert (tmp_path / "comparison" / "report.html").is_file()
     for landmark, true in TRUE_LANDMARKS.items():
@@ -336,16 +346,16 @@ def test_programs_on_the_page_of_own_scripts_find_the_landmarks(
 
 
 def test_first_page_makes_a_sequence_a_report_and_a_log_from_arrays(tmp_path):
-    (program,) = blocks((TUTORIALS / "README.md").read_text(encoding="utf-8"), "python")
+    (program,) = blocks(page_of("README.md"), "python")
     head, tail = program.split("20 * 10**9")
     shorter = f"{head}6 * 10**9{tail}"
-    output(tmp_path, "python", "-W", "error", "-c", shorter)
+    python(tmp_path, "-c", shorter)
     assert (tmp_path / "comparison" / "report.html").is_file()
     assert read_log(tmp_path / "dive.mcap").depth.z_m[0] == -2.0
 
 
 def test_every_tutorial_is_listed_and_run():
-    listed = (TUTORIALS / "README.md").read_text(encoding="utf-8")
+    listed = page_of("README.md")
     run_here = Path(__file__).read_text(encoding="utf-8")
     for script in (
         *TUTORIALS.glob("0*"),
@@ -360,12 +370,12 @@ def test_page_on_doubtful_identities_has_commands_that_work(
     tmp_path,
 ):
     pytest.importorskip("dask", reason="needs sonar-graph[bench]")
-    page = (TUTORIALS / "08_doubtful_identities.md").read_text(encoding="utf-8")
+    page = page_of("08_doubtful_identities.md")
     (suite,) = blocks(page, "toml")
     (tmp_path / "policies.toml").write_text(suite, encoding="utf-8")
     printed = {
         words: output(tmp_path, "sonar-graph", *words.split(), COLUMNS="300")
-        for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
+        for words in commands(page)
     }
     for words, said in {
         "run basin.mcap -o gated --set isam2.identity.policy=gate": (
@@ -378,8 +388,7 @@ def test_page_on_doubtful_identities_has_commands_that_work(
     }.items():
         assert said in printed[words]
     compared, asked = (
-        output(tmp_path, "python", "-W", "error", "-c", program)
-        for program in blocks(page, "python")
+        python(tmp_path, "-c", program) for program in blocks(page, "python")
     )
     off_m = [
         number_after(compared, rf"{name} [\d.]+")
