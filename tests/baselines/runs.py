@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,9 +31,6 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
 from tests.navigation import rows
 from tests.navigation.rows import T0_NS
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
-
 
 STANDARD_FORCE = np.array([0.0, 0.0, 9.80665])
 

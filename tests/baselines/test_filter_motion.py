@@ -1,15 +1,11 @@
 """Laws of prediction: paths, their covariances, biases and attitudes that come of motions alone."""
 
-import importlib.util
-import sys
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from baselines.dead_reckoning import DeadReckoning
-from baselines.ekf_slam import COMPASS, EkfSlam
+from baselines.ekf_slam import EkfSlam
 from baselines.filter import motion_of
 from sonar_graph.calibration import (
     Calibration,
@@ -19,11 +15,9 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Measurements
-from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.states import Outcome
 
 from .runs import (
-    BENCHMARKS,
     CIRCLE_S,
     CIRCLE_START,
     NO_FORCE,
@@ -130,44 +124,6 @@ def test_a_gap_adds_what_an_unknown_gyro_bias_does_to_the_displacement():
     # else the order would not be seen
     assert np.abs(J @ J.T - J.T @ J).max() > 0.05 * np.linalg.norm(J) ** 2
     assert sigma**2 * np.linalg.norm(J) ** 2 > 0.1 * np.trace(covariance[3:, 3:])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("predicts_by_node", [False, True])
-def test_ekf_slam_on_filterpy_ends_in_the_same_state(monkeypatch, predicts_by_node):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    spec = importlib.util.spec_from_file_location(
-        "filterpy_ekf", BENCHMARKS / "filterpy_ekf.py"
-    )
-    filterpy_ekf = importlib.util.module_from_spec(spec)
-    # dataclasses look their module up
-    monkeypatch.setitem(sys.modules, "filterpy_ekf", filterpy_ekf)
-    spec.loader.exec_module(filterpy_ekf)
-
-    mission = simulate_mission(
-        MissionOptions(duration_s=40.0, landmarks=12, dvl_dropouts_per_hour=360.0)
-    )
-    # filterpy's takes straight lines
-    never_a_gap = mission.calibration.dvl.model_copy(update={"gap_s": 1e3})
-    mission = replace(
-        mission, calibration=mission.calibration.model_copy(update={"dvl": never_a_gap})
-    )
-    slam = begun(EkfSlam, mission.calibration)
-    for window in mission.replay(mission.instants(2.0)):
-        slam.process(window)
-    theirs = filterpy_ekf.run(
-        mission, int(mission.instants(2.0)[-1]), predicts_by_node=predicts_by_node
-    )
-    node_ns, x, P = slam.state()
-    x = np.delete(x, COMPASS)
-    P = np.delete(np.delete(P, COMPASS, 0), COMPASS, 1)
-    assert node_ns == theirs.node_ns
-    assert len(x) > 6 + 3 * 5
-    sigma = np.sqrt(np.diag(P))
-    assert_allclose(x, theirs.x, atol=1e-8)
-    assert_allclose(
-        P / np.outer(sigma, sigma), theirs.P / np.outer(sigma, sigma), atol=1e-8
-    )
 
 
 def test_a_pitch_beyond_the_vertical_is_told_before_the_prediction_folds_it_back():

@@ -21,7 +21,6 @@ from sonar_graph.numerics import chi_square_quantile
 from sonar_graph.testing.numerical import central_differences
 
 from .filters import (
-    BODY_M,
     CALIBRATION,
     NOISE,
     STILL,
@@ -70,20 +69,6 @@ def test_a_known_floor_fixes_the_height_of_a_new_landmark(filter_):
     )
     assert_allclose(position, true, atol=1e-3)
     assert covariance[2, 2] == pytest.approx(1e-6, rel=0.01)
-
-
-@both
-def test_without_a_floor_a_new_landmark_is_on_the_centre_beam(
-    filter_,
-):
-    world, P = bare(filter_, TILTED, 0.003)
-    middle = locate(sonar_after(world, MOTION), 3.0, 0.3, 0.0)
-    for calibration in (CALIBRATION, floored(BODY_M[2] - 5.0)):
-        slam, position, _ = augmented(filter_, TILTED, 0.003, [3.0, 0.3], calibration)
-        assert_allclose(position, middle, atol=1e-12)
-        after, covariance = filter_.estimate(slam)
-        assert_array_equal(after.X, world.X)
-        assert_array_equal(covariance[: len(P), : len(P)], P)
 
 
 @both

@@ -1,10 +1,7 @@
 """Laws of what is observable: world frame, heading and gyro bias."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.testing import assert_allclose
-from scipy.spatial.transform import Rotation
 
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.calibration import (
@@ -22,48 +19,8 @@ from sonar_graph.states import Outcome
 from .runs import dvl, imu, later, run, seen, slam_filters
 
 
-def started(sequence, **changes):
-    """The same measurements with another start."""
-    start = sequence.calibration.start.model_copy(update=changes)
-    return replace(
-        sequence, calibration=sequence.calibration.model_copy(update={"start": start})
-    )
-
-
-def test_the_world_s_frame_changes_nothing_but_the_frame(mission):
-    turn = Rotation.from_euler("z", 2.0)
-    shift = np.array([300.0, -200.0, 0.0])
-    start = mission.calibration.start
-    roll, pitch, yaw = start.rpy_rad
-    moved = started(
-        mission,
-        position_m=tuple(turn.apply(start.position_m) + shift),
-        rpy_rad=(roll, pitch, yaw + 2.0),
-    )
-    here = run(InvariantEkf, mission)
-    there = run(InvariantEkf, moved)
-    for one, other in (
-        (here.trajectory(), there.trajectory()),
-        (here.landmarks(), there.landmarks()),
-    ):
-        assert_allclose(other.positions, turn.apply(one.positions) + shift, atol=1e-6)
-    into_body = (
-        turn * here.trajectory().rotations()
-    ).inv() * there.trajectory().rotations()
-    assert_allclose(into_body.magnitude(), 0.0, atol=1e-7)
-    assert_allclose(
-        there.trajectory().covariances, here.trajectory().covariances, atol=1e-8
-    )
-    R = turn.as_matrix()
-    assert_allclose(
-        there.landmarks().covariances, R @ here.landmarks().covariances @ R.T, atol=1e-8
-    )
-
-
 @slam_filters
-def test_a_robot_at_rest_learns_a_heading_only_in_the_plain_filter(
-    kind,
-):
+def test_a_robot_at_rest_learns_a_heading_only_in_the_plain_filter(kind):
     """Heading unknown to 0.3 rad. Julier and Uhlmann, "A counter example to the theory of SLAM", ICRA 2001."""
     rng = np.random.default_rng(0)
     t = later(*np.arange(0.2, 20.1, 0.2))

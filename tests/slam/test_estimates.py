@@ -80,20 +80,19 @@ def dense(estimator: Isam2, values: gtsam.Values, keys: list[int]) -> Floats:
     return dense_covariance(factors_of(estimator.graph), values, keys)
 
 
-KEYFRAMES = [4, 0, 2]
-
-
-LANDMARKS = [5, 2]
-
-
-KEYS = [L(2), L(5), X(0), X(2), X(4)]
-
-
 def test_over_the_history_it_is_the_inverse_of_the_whole_information():
+    """A keyframe is known by its number and by its stamp, and each variable once."""
     estimator = ran(5.0)
+    stamps_ns = estimator.keyframe_stamps()
     values = gtsams_solution(estimator.graph, estimator.values)
-    found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS, over="history")
-    assert off_sigmas(found.matrix, dense(estimator, values, KEYS)) < 1e-4
+    found = estimator.joint_covariance(
+        [4, 0], [int(stamps_ns[2]), int(stamps_ns[0])], [5, 2], over="history"
+    )
+    keys = [L(2), L(5), X(0), X(2), X(4)]
+    assert off_sigmas(found.matrix, dense(estimator, values, keys)) < 1e-4
+    of_one = estimator.marginal(stamp_ns=int(stamps_ns[2]), over="history")
+    assert np.array_equal(of_one, estimator.marginal(keyframe=2, over="history"))
+    assert np.allclose(found.at(X(2), X(2)), of_one, rtol=1e-9)
     of_one = estimator.joint_covariance(landmarks=np.array([5])).matrix
     assert np.array_equal(of_one, estimator.marginal(landmark=5))
     assert np.array_equal(found.at(L(5), X(2)), found.matrix[3:6, 12:18])
@@ -108,22 +107,6 @@ def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
     assert off_sigmas(found.matrix, expected) < 1e-4
     of_window = estimator.joint_covariance([newest], (), [5, 2]).matrix
     assert off_sigmas(of_window, found.matrix) < 0.05
-
-
-def test_a_keyframe_is_known_by_its_stamp_as_by_its_number():
-    estimator = ran(5.0)
-    stamps = estimator.keyframe_stamps()
-    by_number = estimator.marginal(keyframe=3, over="history")
-    assert np.array_equal(
-        estimator.marginal(stamp_ns=int(stamps[3]), over="history"), by_number
-    )
-    assert not np.allclose(
-        estimator.marginal(stamp_ns=int(stamps[2]), over="history"), by_number
-    )
-    assert by_number.shape == (6, 6)
-    joint = estimator.joint_covariance([3], [int(stamps[3])], [2], over="history")
-    assert joint.matrix.shape == (9, 9)
-    assert np.allclose(joint.at(X(3), X(3)), by_number, rtol=1e-9)
 
 
 REFUSED = [
@@ -156,8 +139,6 @@ def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(
     asked: dict, said: str
 ):
     estimator = ran(5.0, "bounded" if asked.get("over") == "history" else "whole")
-    if asked.get("stamp_ns") == "after the second":
-        asked = {"stamp_ns": int(estimator.keyframe_stamps()[1]) + 1}
     is_joint = asked.keys() & {"landmarks", "keyframes", "stamps_ns"}
     with pytest.raises(EstimatorError, match=f"^isam2: {said}") as caught:
         (estimator.joint_covariance if is_joint else estimator.marginal)(**asked)

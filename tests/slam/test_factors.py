@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
-from sonar_graph.models import RobustKernel, range_azimuth
+from sonar_graph.models import RobustKernel
 from sonar_graph.slam import factors
 from sonar_graph.slam.factors import SightingStack
 from sonar_graph.slam.odometry_factor import OdometryStack, OdometryWithBias
@@ -203,11 +203,8 @@ def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(
     ).values()
     across, up = camera.whitenedError(values)
     assert across == pytest.approx(off[1] / SIGMA[1] * shrunk, rel=1.1e-4)
-    assert shrunk > 0.995
     assert distance.whitenedError(values) == pytest.approx(off[:1] / SIGMA[0], rel=1e-6)
     assert abs(up) < 1e-3
-    predicted = range_azimuth(pose.compose(BODY_T_SONAR), values.atPoint3(L(0)))
-    assert predicted == pytest.approx([range_m, azimuth], abs=1e-6)
 
 
 def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
@@ -240,21 +237,15 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
 @given(roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
 @settings(max_examples=10)
 def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch):
-    sigma = 0.01
-    up_in_body = pose.rotation().matrix().T @ [0, 0, 1.0]
-    truth = factors.gravity_direction(X(0), 9.8 * up_in_body, sigma)
-    assert np.allclose(truth.unwhitenedError(values_of(X0=pose)), 0, atol=1e-12)
-    yawed = gtsam.Pose3(gtsam.Rot3.Rz(1.3).compose(pose.rotation()), pose.translation())
-    assert np.allclose(truth.unwhitenedError(values_of(X0=yawed)), 0, atol=1e-12)
-    tilted = values_of(
-        X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3)))
-    )
-    angle = np.arccos(
-        np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1)
-    )
-    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(
-        2 * np.sin(angle / 2) / sigma, abs=1e-5
-    )
+    up_in_body = pose.rotation().matrix()[2]
+    factor = factors.gravity_direction(X(0), 9.8 * up_in_body, 0.01)
+    yawed = gtsam.Rot3.Rz(1.3).compose(pose.rotation())
+    tilted = yawed.compose(gtsam.Rot3.RzRyRx(roll, pitch, 0))
+    for found, expected in ((yawed, 0.0), (tilted, tilted.matrix()[2] - up_in_body)):
+        values = values_of(X0=gtsam.Pose3(found, pose.translation()))
+        assert np.linalg.norm(factor.whitenedError(values)) == pytest.approx(
+            np.linalg.norm(expected) / 0.01, abs=1e-5
+        )
 
 
 @poses
@@ -285,10 +276,9 @@ def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
     pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
     said = information(factors.planar(X(0), PLANE).values(), values_of(X0=pose), [X(0)])
     assert np.diag(said) == pytest.approx([2500, 2500, 0, 0, 0, 1e4], abs=1e-6)
+    off = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.02, 2.0), [5.0, -3.0, 0.43])
     graph = graph_of(factors.planar(X(0), PLANE).values())
-    assert graph.error(values_of(X0=pose)) < 1e-6
-    off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
-    assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
+    assert graph.error(values_of(X0=off)) == pytest.approx(4.5 + 0.5, rel=1e-4)
 
 
 def assert_is_each_of(made, stack, values: gtsam.Values) -> None:

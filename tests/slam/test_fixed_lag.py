@@ -3,11 +3,11 @@
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 
 from sonar_graph.slam.smoother.window import FixedLagWindow, Thresholds, marginal
 
-from .made import graph_of, isotropic, point_prior, pose_prior, values_of
+from .made import graph_of, isotropic, point_prior, values_of
 
 PRIOR_M = 3.0
 TIGHT_M = 2e-8
@@ -41,27 +41,21 @@ def test_by_qr_a_marginal_has_the_variance_that_cholesky_loses():
     assert not lost.any()
 
 
-def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
-    if k == 0:
-        return pose_prior(X(0), gtsam.Pose3(), sigma)
-    return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, sigma))
-
-
 PRIOR = graph_of([point_prior(L(2), ORIGIN, WEAK_M)])
 
 
 @pytest.mark.parametrize(
-    ("outside", "variance_m2", "is_by_qr"),
-    [(PRIOR, WEAK_M**2, True), (chain()[0], CHAIN_M2, True)],
+    ("outside", "variance_m2"),
+    [(PRIOR, WEAK_M**2), (chain()[0], CHAIN_M2)],
     ids=["factor", "marginal"],
 )
-def test_a_window_counts_factors_outside_of_it_once(outside, variance_m2, is_by_qr):
+def test_a_window_counts_factors_outside_of_it_once(outside, variance_m2):
     """A third and a fourth point, near each other; inside, the third is known to a kilometre."""
     _, solved = chain()
     solved.insert(L(3), ORIGIN)
     inside = graph_of([point_prior(L(2), ORIGIN, WEAK_M), near(2, 3, 0.1)])
     inside.push_back(outside)
-    window = FixedLagWindow(Thresholds(1e-6, 1e-6), is_by_qr=is_by_qr)
+    window = FixedLagWindow(Thresholds(1e-6, 1e-6), is_by_qr=True)
     window.begin(inside, {}, solved, {L(2): 0.0, L(3): 0.0})
     expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / variance_m2)
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(

@@ -1,19 +1,18 @@
 """Detections of a straight dive: gate, first place of a landmark, noise of the motion, waiting; steps of a policy."""
 
-import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Start
-from sonar_graph.measurements import Floats
+from sonar_graph.models import range_azimuth_jacobians
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, SONAR, Dive, spherical
 from .graphs import block_of
-from .made import polar, smoother_with
+from .made import smoother_with
 
 BEAM = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
 """Centre beam of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
@@ -30,7 +29,7 @@ def settle(dive: Dive, updates: int = 1) -> None:
 
 
 def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
-    """S = H P H^T + R by numpy, with H by differences and P the window's joint covariance."""
+    """S = H P H^T + R by numpy, with P the window's joint covariance."""
     dive = Dive()
     truth = np.array([3.0, 0.8, -1.4])
     dive.see(0.0, (5, *spherical(0.0, truth)))
@@ -39,17 +38,9 @@ def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
     P = block_of(dive.smoother.joint_covariance([X(0), L(5)]), [X(0), L(5)])
     world_T_body = dive.smoother.values.atPose3(X(0))
 
-    def expected(change: Floats) -> Floats:
-        pose = world_T_body.compose(gtsam.Pose3.Expmap(change[:6])).compose(
-            SONAR.mounting.pose()
-        )
-        return polar(pose, landmark + change[6:])
-
-    H = np.column_stack(
-        [(expected(1e-6 * a) - expected(-1e-6 * a)) / 2e-6 for a in np.eye(9)]
-    )
-    z = expected(np.zeros(9)) + np.array([0.03, -0.02])
-    dive.see(0.0, (5, *z))
+    z, *by = range_azimuth_jacobians(world_T_body, SONAR.mounting.pose(), landmark)
+    H = np.hstack(by)
+    dive.see(0.0, (5, *(z + np.array([0.03, -0.02]))))
     log = dive.sightings.journal.log()
     assert log.outcomes[-1] is Outcome.USED
     assert log.innovations[-1] == pytest.approx([0.03, -0.02], abs=1e-9)

@@ -66,26 +66,6 @@ def test_incremental_equals_batch_in_the_basin(kernel, bias):
     assert_is_batch(estimator.graph, estimator.values)
 
 
-def test_the_final_answer_is_the_batch_solution(basin):
-    """Trajectory and landmarks with the default settings; the requested instants are the keyframes' and others."""
-    estimator, _ = ran(basin, 7.0)
-    before = gtsam.Values(estimator.values)
-    batch = gtsams_solution(estimator.graph, before, 1e-9)
-    found = estimator.landmarks()
-    smoothed = estimator.trajectory()
-    for landmark_id, position in zip(found.ids.tolist(), found.positions, strict=True):
-        assert position == pytest.approx(batch.atPoint3(L(landmark_id)), abs=1e-3)
-    batch_positions = np.array(
-        [batch.atPose3(key).translation() for key in poses_in(batch)[1:]]
-    )
-    nearest = np.min(
-        np.linalg.norm(smoothed.positions[None] - batch_positions[:, None], axis=2),
-        axis=1,
-    )
-    assert np.median(nearest) < 1e-3
-    assert estimator.values.equals(before, 0.0)
-
-
 def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
     truth = sequence.truth.at(np.array([e.stamp_ns for e in estimates]))
     off = np.array([e.world_T_body.translation() for e in estimates]) - truth.positions
@@ -133,34 +113,22 @@ def test_noise_of_zero_is_refused_by_name(basin, section, name):
         Isam2(calibration, Odometry(calibration))
 
 
-def test_the_newest_landmarks_are_those_of_the_window(
-    basin,
-) -> None:
+def test_the_newest_landmarks_are_those_of_the_window(basin):
     """For a live run, whose map must not wait for the solution of the whole graph; asking leaves no trace."""
     estimator, _ = ran(basin, 7.0)
     newest = estimator.newest_landmarks()
     solved = estimator.landmarks()
-    np.testing.assert_array_equal(newest.ids, solved.ids)
-    assert len(newest) == 4
-    for landmark_id, position, cov in zip(
+    assert newest.ids.tolist() == solved.ids.tolist() == [1, 2, 3, 4]
+    for landmark, position, cov in zip(
         newest.ids.tolist(), newest.positions, newest.covariances, strict=True
     ):
-        np.testing.assert_array_equal(
-            position, estimator.values.atPoint3(L(landmark_id))
-        )
-        np.testing.assert_allclose(
-            cov, estimator.marginal(landmark=landmark_id, over="window"), rtol=1e-9
-        )
+        assert np.array_equal(position, estimator.values.atPoint3(L(landmark)))
+        in_window = estimator.marginal(landmark=landmark, over="window")
+        np.testing.assert_allclose(cov, in_window, rtol=1e-9)
     off = newest.positions - solved.positions
-    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(newest.covariances), off)
-    assert nees.max() < 1.0
-    ratio = np.trace(newest.covariances, axis1=1, axis2=2) / np.trace(
-        solved.covariances, axis1=1, axis2=2
-    )
-    assert ((ratio > 0.8) & (ratio < 1.25)).all()
-    assert (
-        estimator.newest_landmarks().positions.tobytes() == newest.positions.tobytes()
-    )
+    assert 0.0 < normalised_squares(off, newest.covariances).max() < 1.0
+    again = estimator.newest_landmarks()
+    assert np.array_equal(again.positions, newest.positions)
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {

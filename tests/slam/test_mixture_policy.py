@@ -1,13 +1,9 @@
 """Max-mixture in the window: a fixed point that another solver finds, and choices that follow the estimate."""
 
-from dataclasses import replace
-
-import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.calibration import FloorPrior
 from sonar_graph.models import Kernel
 from sonar_graph.slam import (
     GaussianKernel,
@@ -16,12 +12,8 @@ from sonar_graph.slam import (
     RobustKernel,
 )
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
-from sonar_graph.slam.landmarks.mixture import (
-    TrackedObject,
-)
 from sonar_graph.states import Outcome
 
-from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 
 PLACES = {
@@ -130,14 +122,3 @@ def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:
     assert len(world.sightings.landmarks.sightings(9)) == 5
     values = world.sightings.smoothed().values
     assert np.linalg.norm(values.atPoint3(L(9)) - PLACES[9]) < 0.1
-
-
-# A small world, in which all choices can be tried --------------------------------------------------------------------
-
-
-def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
-    """One sighting from pose k of landmark 7 or 4, surely named."""
-    found = small.watch(values, small.PLACES[place], [k], np.zeros((1, 2)), {said: 0.9})
-    floor = FloorPrior(z_m=float(small.PLACES[place][2]), sigma_m=0.05)
-    found.sightings[0] = replace(found.sightings[0], floor=floor)
-    return found

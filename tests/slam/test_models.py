@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
@@ -25,7 +25,6 @@ from sonar_graph.slam.smoother import JointCovariance
 from sonar_graph.testing import check_derivative
 from sonar_graph.testing.numerical import central_differences
 
-from .graphs import block_of
 from .made import POSES, polar, random_covariance, some_motion
 
 angles = st.floats(-3.0, 3.0)
@@ -83,7 +82,6 @@ BODY_T_SONAR = gtsam.Pose3(
     gtsam.Rot3.RzRyRx(0.1, 0.4, -0.3), np.array([0.4, 0.1, -0.2])
 )
 keyframes = pytest.mark.parametrize("keyframe", POSES.values(), ids=POSES)
-with_bias = pytest.mark.parametrize("bias", [True, False], ids=["bias", "no bias"])
 
 
 def joint_of(cov: Floats, sizes: dict[int, int]) -> JointCovariance:
@@ -108,21 +106,6 @@ def made(keyframe, motion, joint, bias: bool = True) -> PredictedView:
     )
 
 
-def expected_of(
-    view: PredictedView, landmarks: dict[int, Floats], *ids: int
-) -> tuple[Floats, Floats]:
-    return view.expect([L(i) for i in ids], np.array([landmarks[i] for i in ids]))
-
-
-def some_view(keyframe: gtsam.Pose3, bias: bool, seed: int = 0, sigma: float = 0.02):
-    """View of landmarks 5 and 6, and its parts."""
-    motion = some_motion(seed, sigma / 2)
-    landmarks = {5: ahead(keyframe, motion), 6: ahead(keyframe, motion, -0.6)}
-    sizes = {X(2): 6, L(5): 3, L(6): 3} | ({B(0): 11} if bias else {})
-    joint = joint_of(random_covariance(sum(sizes.values()), sigma, seed + 2), sizes)
-    return made(keyframe, motion, joint, bias), motion, landmarks, joint
-
-
 def moved(
     keyframe: gtsam.Pose3,
     motion: PreintegratedMotion,
@@ -135,104 +118,59 @@ def moved(
     return keyframe.compose(gtsam.Pose3.Expmap(xi)).compose(motion.i_T_j).compose(wrong)
 
 
-def numerical_of_view(
-    keyframe: gtsam.Pose3, motion: PreintegratedMotion, point: Floats
-) -> Floats:
-    """Derivative of what is observed by (pose, landmark, bias, motion), by differences, shape (2, 26)."""
-
-    def at(change: Floats) -> Floats:
-        return observed(
-            moved(keyframe, motion, change[:6], change[9:20], change[20:]),
-            point + change[6:9],
-        )
-
-    return central_differences(at, np.zeros(26), angles=[1])
-
-
-@keyframes
-@with_bias
-@pytest.mark.parametrize("seed", range(3))
-def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed):
-    """H P H' of pose, landmark and bias together, and the motion's noise, with derivatives by differences.
-
-    Expected jointly each landmark is as alone.
-    """
-    view, motion, landmarks, joint = some_view(keyframe, bias, seed)
-    together, cov = view.expect_jointly(
-        [L(5), L(6)], np.array([landmarks[5], landmarks[6]]), []
-    )
-    for k, (landmark_id, point) in enumerate(landmarks.items()):
-        keys = [X(2), L(landmark_id), *([B(0)] if bias else [])]
-        P = block_of(joint, keys)
-        H = numerical_of_view(keyframe, motion, point)
-        state = H[:, : len(P)]
-        expected = state @ P @ state.T + H[:, 20:] @ motion.covariance @ H[:, 20:].T
-        (z,), (S,) = expected_of(view, landmarks, landmark_id)
-        assert z == pytest.approx(observed(keyframe.compose(motion.i_T_j), point))
-        assert np.allclose(S, expected, rtol=1e-6, atol=1e-12)
-        assert together[k] == pytest.approx(z, abs=1e-12)
-        assert cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] == pytest.approx(S, rel=1e-9)
-
-
 @keyframes
 def test_blurred_noise_is_the_noise_and_the_variances_of_the_motion(keyframe):
-    view, motion, landmarks, _ = some_view(keyframe, True)
+    motion = some_motion(0, 0.01)
+    point = ahead(keyframe, motion)
+    view = made(keyframe, motion, joint_of(np.eye(6), {X(2): 6}))
     R = np.array([[4e-4, 3e-5], [3e-5, 8e-5]])
-    H = numerical_of_view(keyframe, motion, landmarks[5])[:, 20:]
+    still = np.zeros(17)
+    H = central_differences(
+        lambda noise: observed(
+            moved(keyframe, motion, still[:6], still[6:], noise), point
+        ),
+        still[:6],
+        angles=[1],
+    )
     short = some_motion(9)
     expected = R + np.diag(np.diag(H @ short.covariance @ H.T))
     kept = R.copy()
-    assert np.allclose(
-        view.blurred(R[None], short, landmarks[5][None])[0],
-        expected,
-        rtol=1e-6,
-        atol=1e-12,
-    )
+    blurred = view.blurred(R[None], short, point[None])[0]
+    assert_allclose(blurred, expected, rtol=1e-6, atol=1e-12)
     assert np.array_equal(R, kept)
     assert np.all(np.diag(expected) > 1.01 * np.diag(R))
 
 
-@pytest.mark.parametrize(
-    ("azimuth_sigma", "larger"),
-    [(0.03, 25.0), (0.08, 64.0)],
-    ids=["by range", "by azimuth"],
-)
-@given(
-    st.floats(-np.pi, np.pi),
-    st.floats(-np.pi, np.pi),
-    st.floats(-1, 1),
-    st.floats(-0.9, 0.9),
-    st.floats(-0.9, 0.9),
-)
-@settings(max_examples=25)
-def test_weighing_is_mahalanobis_of_the_wrapped_innovation(
-    azimuth_sigma, larger, measured, expected, range_off, by_prior, by_noise
-):
-    def cov(range_sigma: float, azimuth_sigma: float, correlation: float) -> Floats:
-        off = correlation * range_sigma * azimuth_sigma
-        return np.array([[range_sigma**2, off], [off, azimuth_sigma**2]])
-
-    prior = cov(0.1, azimuth_sigma, by_prior)
-    noise = cov(0.02, 0.01, by_noise)
-    z = np.array([[3.0 + range_off, measured]])
-    predicted = np.array([[3.0, expected]])
-    (innovation,), (S,), (distance,), (gain,) = weigh(z, predicted, prior, noise[None])
-    assert innovation[0] == pytest.approx(range_off)
-    assert abs(innovation[1]) <= np.pi + 1e-12
-    assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)
-    assert np.array_equal(S, prior + noise)
-    assert distance == pytest.approx(
-        innovation @ np.linalg.solve(S, innovation), rel=1e-9, abs=1e-12
-    )
-    assert gain == pytest.approx(larger)
+def test_weighing_is_mahalanobis_of_the_wrapped_innovation():
+    """Of detections whose expectations are correlated; a gain is the larger ratio of expected variance to noise."""
+    rng = np.random.default_rng(0)
+    m = 50
+    z, expected = rng.uniform(-np.pi, np.pi, (2, m, 2))
+    joint = random_covariance(2 * m, 0.1)
+    noise = np.array([random_covariance(2, 0.05, k) for k in range(m)])
+    found = weigh(z, expected, joint, noise)
+    for k, (e, S, distance, gain) in enumerate(zip(*found, strict=True)):
+        prior = joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        off = z[k] - expected[k]
+        assert e == pytest.approx([off[0], math.remainder(off[1], 2 * math.pi)])
+        assert np.array_equal(S, prior + noise[k])
+        assert distance == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-9)
+        assert gain == pytest.approx(np.max(np.diag(prior) / np.diag(noise[k])))
+    assert (np.abs(z - expected)[:, 1] > np.pi).any()
 
 
+@keyframes
+@pytest.mark.parametrize("bias", [True, False], ids=["bias", "no bias"])
 @pytest.mark.parametrize(
     "seen_from", [X(1), X(2)], ids=["an earlier keyframe", "the same keyframe"]
 )
-def test_the_joint_covariance_is_that_of_all_that_is_uncertain(seen_from: int):
-    """``H P H'`` of keyframes, bias, landmark, motion and the located point's own noise, by differences."""
-    keyframe = POSES["random"]
+def test_the_joint_covariance_is_that_of_all_that_is_uncertain(
+    keyframe, bias, seen_from
+):
+    """``H P H'`` of keyframes, bias, landmark, motion and the located point's own noise, by differences.
+
+    A landmark that is expected alone is as beside others.
+    """
     motion = some_motion(3, 0.001)
     earlier = keyframe.compose(
         gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([-0.4, 0.2, 0.0]))
@@ -247,7 +185,8 @@ def test_the_joint_covariance_is_that_of_all_that_is_uncertain(seen_from: int):
 
     def shown(change: Floats) -> Floats:
         of_anchor = change[:6] if seen_from == X(1) else change[6:12]
-        body = moved(keyframe, motion, change[6:12], change[12:23], change[26:32])
+        db = bias * change[12:23]
+        body = moved(keyframe, motion, change[6:12], db, change[26:32])
         seen = [
             observed(body, landmark + change[23:26]),
             observed(body, point_from(of_anchor) + change[32:]),
@@ -261,13 +200,15 @@ def test_the_joint_covariance_is_that_of_all_that_is_uncertain(seen_from: int):
     source = Source(
         seen_from, located, central_differences(point_from, np.zeros(6)), own
     )
-    z, S = made(keyframe, motion, joint).expect_jointly(
-        [L(5)], landmark[None], [source]
-    )
+    view = made(keyframe, motion, joint, bias)
+    z, S = view.expect_jointly([L(5)], landmark[None], [source])
+    alone = view.expect([L(5)], landmark[None])
     H = central_differences(shown, np.zeros(35), angles=[1, 3])  # (4, 35)
     P = block_diag(joint.matrix, motion.covariance, own)  # (35, 35)
     assert z.ravel() == pytest.approx(shown(np.zeros(35)))
-    assert_allclose(S, H @ P @ H.T, rtol=1e-5, atol=1e-6 * np.abs(S).max())
+    assert_allclose(S, H @ P @ H.T, rtol=1e-6, atol=1e-8 * np.abs(S).max())
+    assert_allclose(alone[0], z[:1], rtol=1e-12)
+    assert_allclose(alone[1][0], S[:2, :2], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -48,24 +48,6 @@ END_S = (NODES - 1) * STEP_S
 _, NUMBERS = rail(NODES)
 
 
-@pytest.mark.parametrize(
-    "lag_s", [FOREVER_S, 2.6, 0.6], ids=["all", "five poses", "one pose"]
-)
-def test_on_the_rail_window_and_history_are_least_squares(lag_s):
-    """Marginalising is exact where nothing is linearised: means and covariances to 1e-8."""
-    fed = on_the_rail(NODES, lag_s)
-    assert_is_least_squares(fed, NUMBERS, NODES)
-    mean, variance = NUMBERS.solution(NODES)
-    values, marginals = fed.smoother.solve_history()
-    for k in range(NODES):
-        assert values.atPose3(X(k)).translation()[0] == pytest.approx(
-            mean[f"x{k}"], abs=1e-8
-        )
-        assert marginals.marginalCovariance(X(k))[3, 3] == pytest.approx(
-            variance[f"x{k}"], abs=1e-8
-        )
-
-
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 1.1], ids=["in the window", "not in it"])
 def test_a_joint_covariance_of_any_poses_is_that_of_all_factors(lag_s):
     fed = in_the_basin(15, lag_s)
