@@ -65,7 +65,7 @@ def blocks(page: str, language: str) -> list[str]:
 
 def commands(page: str) -> list[str]:
     """What follows ``sonar-graph`` in the indented lines of a page."""
-    return commands(page)
+    return re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
 
 
 def number_after(text: str, pattern: str) -> float:
