@@ -66,6 +66,7 @@ def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install
         expected[f"causal.{key}"] = 0.0
     found = {key: scores[key].value for key in expected}
     assert found == pytest.approx(expected, abs=1e-9)
+    assert abs(found["landmarks.se2_m"]) < 1e-12
     known = set(SCORES)
     assert known - set(scores) <= {"memory.peak_mb", "causal.own_map_m"}
     assert set(scores) <= known

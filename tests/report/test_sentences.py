@@ -423,7 +423,7 @@ def test_errors_that_last_from_sighting_to_sighting_are_named_with_the_sigma_to_
     assert said(notes={"log.sensors": "reference against IMU: late"})
 
 
-def test_runs_that_agree_with_each_other_and_not_with_the_truth_share_a_fault():
+def test_runs_that_agree_with_each_other_and_not_the_truth_share_a_fault():
     def said(*offs_m):
         comparison = basin_comparison(60)
         for name, off_m in zip(("isam2", "ekf-slam"), offs_m, strict=True):
