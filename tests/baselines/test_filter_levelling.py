@@ -17,7 +17,6 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome, Refusal
 
 from .runs import (
-    NO_FORCE,
     STANDARD_FORCE,
     T0_NS,
     depths,
@@ -31,25 +30,6 @@ from .runs import (
     seen,
     slam_filters,
 )
-
-
-@slam_filters
-@pytest.mark.parametrize("is_felt", [True, False])
-def test_gravity_tells_roll_and_pitch_and_nothing_else_does(kind, is_felt):
-    """Start level, lie tilted."""
-    R = np.array(Start(rpy_rad=(0.1, -0.07, 0.0)).pose().rotation().matrix())
-    rows = imu(20, force=R.T @ STANDARD_FORCE if is_felt else NO_FORCE), dvl(20)
-    estimate = estimate_after(
-        kind, Calibration(start=Start(rpy_sigma_rad=(0.2, 0.2, 1e-3))), 20, *rows
-    )
-    sigma = np.sqrt(np.diag(estimate.covariance)[:2])
-    expected = [0.1, -0.07] if is_felt else [0.0, 0.0]
-    assert_allclose(
-        estimate.world_T_body.rotation().rpy()[:2],
-        expected,
-        atol=1e-3 if is_felt else 1e-9,
-    )
-    assert sigma.max() < 2.5e-3 if is_felt else sigma.min() > 0.19
 
 
 @slam_filters

@@ -161,17 +161,6 @@ def accelerated() -> tuple[PreintegratedMotion, Floats, Floats, Rotation]:
     return motion, *attitude(ends).inv().apply(velocity_at(ends)), attitude(ends)[1]
 
 
-def test_up_is_found_in_a_moving_vehicle():
-    """And would be off by degrees, were the vehicle's own acceleration left in."""
-    motion, v_i, v_j, end = accelerated()
-    truth = end.inv().apply([0, 0, 1.0])
-    up, _ = gravity_direction(motion, v_i, v_j, 0.01, MOVING)
-    assert np.linalg.norm(up) == pytest.approx(1)
-    assert np.linalg.norm(np.cross(up, truth)) < 1e-4
-    naive, _ = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, MOVING)
-    assert np.arccos(naive @ truth) > np.radians(1)
-
-
 def test_stated_sigma_is_that_of_many_noisy_intervals():
     """Two-sided, about both horizontal axes, with noise in force, bias, both velocities, and gyros."""
     motion, v_i, v_j, end = accelerated()
@@ -194,6 +183,7 @@ def test_stated_sigma_is_that_of_many_noisy_intervals():
         up, sigma = gravity_direction(
             noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, MOVING
         )
+        assert np.linalg.norm(up) == pytest.approx(1.0)
         up = up + np.cross(by_gyros * rng.standard_normal(3), up)
         squares.append(np.sum((level @ up / sigma) ** 2))
     check_consistent(squares, 2, confidence=0.999)
@@ -206,19 +196,18 @@ def test_without_forces_there_is_no_direction():
 
 @pytest.mark.parametrize(
     ("latitude_deg", "rate"),
-    [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])],
+    [(0, [0, 15.04107, 0]), (90, [0, 0, 15.04107]), (-90, [0, 0, -15.04107])],
 )
 def test_the_earth_turns_north_at_the_equator_and_up_at_the_north_pole(
     latitude_deg, rate
 ):
-    """Degrees an hour; once a sidereal day."""
+    """Degrees an hour."""
     known = Calibration(earth_rate_latitude_rad=np.radians(latitude_deg))
     found = np.degrees(earth_rate_in_world(known)) * 3600
-    assert found == pytest.approx(rate, abs=1e-3)
+    assert found == pytest.approx(rate, abs=1e-5)
     assert earth_up_and_level(known) == pytest.approx(
         earth_rate_in_world(known)[[2, 1]]
     )
-    assert 360 / np.linalg.norm(found) == pytest.approx(23.9345, abs=1e-4)
     assert earth_rate_in_world(Calibration()) is None
     assert earth_up_and_level(Calibration()) == (0.0, 0.0)
 

@@ -187,7 +187,7 @@ def circling(gyro_delay_s: float, seed: int) -> tuple[Imu, Dvl]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_gyros_with_a_slower_filter_make_no_pitch_of_the_doppler_log(seed: int):
+def test_gyros_with_a_slower_filter_make_no_pitch_of_the_doppler_log(seed):
     """Gravity felt through a tilt that comes 5 ms later changes the velocity as a log does that is pitched by degrees."""
     found = match_dvl_to_imu(*circling(0.005, seed), Calibration())
     _, pitch, _ = found.turn
@@ -199,9 +199,7 @@ def test_gyros_with_a_slower_filter_make_no_pitch_of_the_doppler_log(seed: int):
     ("kind", "column", "size"),
     [("lever", 4, 0.1), ("force", 7, 1e-3), ("gyro", 10, 1e-4)],
 )
-def test_derivatives_are_those_of_what_is_lined_up(
-    kind: str, column: int, size: float, axis: int
-):
+def test_derivatives_are_those_of_what_is_lined_up(kind, column, size, axis):
     """The first stretch with an arm or a bias of its own, less without: the column, but for gravity and its turning."""
 
     def first(change: np.ndarray) -> SampleSeries:

@@ -78,45 +78,37 @@ def assert_same(one: PreintegratedMotion, other: PreintegratedMotion) -> None:
     )
 
 
-@given(
-    st.lists(st.integers(0, round(SECONDS * NS)), min_size=8, max_size=8).map(sorted),
-    st.just(list(range(9))) | st.permutations(range(9)),
-)
+@given(st.permutations(range(9)))
 @settings(max_examples=10)
-def test_motion_does_not_depend_on_cuts_and_order_of_the_rows(cuts, order):
-    imu_rows, dvl_rows = recorded()
+def test_motion_does_not_depend_on_the_order_of_the_rows(order):
     agile = Calibration(dvl=DvlCalibration(velocity_walk_density=2.0))
-    whole = odometry_of(imu_rows, dvl_rows, agile)
+    whole = odometry_of(*recorded(), agile)
     pieces = Odometry(agile)
-    edges = [0, *(T0_NS + cut for cut in cuts), T0_NS + 10 * NS]
     for k in order:
         pieces.add(
-            imu_rows.between(edges[k], edges[k + 1]),
-            dvl_rows.between(edges[k], edges[k + 1]),
+            *(
+                block.between(at(0.4 * k - 0.3), at(0.4 * k + 0.1))
+                for block in recorded()
+            )
         )
-    epochs = whole.epochs(T0_NS, T0_NS + 10 * NS)
-    first, last = (int(epochs[k]) for k in (0, -1))
+    first, *_, last = whole.epochs(0, at(10.0)).tolist()
     assert not pieces.refused
     assert pieces.start_by(last) == whole.start_by(last)
     assert same(pieces.motion(first, last, BIAS), whole.motion(first, last, BIAS))
 
 
 def test_velocity_at_an_epoch_is_that_of_the_imus_point_of_a_rigid_body():
-    """By its row and the rate in between; and by differences of two points' positions on a turning body."""
+    """By its row and the rate in between."""
     imu_rows, dvl_rows = recorded()
     arm = np.array([0.5, -0.1, 0.3])
     known = Calibration(imu=ImuCalibration(mounting=Mounting(translation_m=tuple(arm))))
+    epoch_ns = int(dvl_rows.stamps_ns[5])
     velocity, variance = odometry_of(imu_rows, dvl_rows, known).velocity_at_imu(
-        int(dvl_rows.stamps_ns[5])
+        epoch_ns
     )
-    t = (np.r_[imu_rows.stamps_ns, dvl_rows.stamps_ns[5]] - T0_NS) * 1e-9
-    rate = np.array(
-        [np.interp(t[-1], t[:-1], column) for column in imu_rows.angular_velocity.T]
-    )
-    moved = gtsam.Pose3.Expmap(
-        1e-6 * np.concatenate([rate, dvl_rows.velocity[5]])
-    ).transformFrom(arm)
-    assert velocity == pytest.approx((moved - arm) / 1e-6, abs=1e-5)
+    since = (imu_rows.stamps_ns - epoch_ns) * 1e-9
+    rate = [np.interp(0.0, since, column) for column in imu_rows.angular_velocity.T]
+    assert velocity == pytest.approx(dvl_rows.velocity[5] + np.cross(rate, arm))
     assert variance == pytest.approx(np.trace(dvl_rows.velocity_cov[5]) / 3.0)
     with pytest.raises(MeasurementError, match=rf"epoch_ns: {at(0.25)} is none of the"):
         odometry_of(imu_rows, dvl_rows).velocity_at_imu(at(0.25))
@@ -373,17 +365,12 @@ def test_a_chain_is_the_motion_of_the_whole_wherever_it_is_cut(cut, other_cut):
 @pytest.mark.parametrize(
     ("start_s", "end_s"),
     [
-        *(
-            (1.03, 1.17),
-            (5.9, 6.0),
-            (5.93, 8.31),
-            (6.0, 12.0),
-            (6.0, 16.0),
-            (6.0, 17.3),
-            (8.07, 8.36),
-            (13.0, 15.9),
-        ),
-        *((5.03, 16.53), (16.0, 16.1)),
+        (1.03, 1.17),
+        (5.93, 8.31),
+        (6.0, 16.0),
+        (8.07, 8.36),
+        (13.0, 15.9),
+        (5.03, 16.53),
     ],
 )
 def test_motion_is_that_of_the_vehicle_before_in_over_and_after_a_gap(start_s, end_s):

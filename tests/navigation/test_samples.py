@@ -77,16 +77,15 @@ def test_rows_are_late_up_to_the_settled_stamp():
 
 
 def test_of_equal_stamps_the_first_counts():
-    one = dvl(stamps(5, 1.0), [0.8, 0.0, 0.0])
-    other = dvl(stamps(5, 1.0), [0.81, 0.0, 0.0])
-    within = dvl(
-        np.repeat(stamps(5, 1.0), 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1))
-    )
+    """In one block and in two."""
+    ns = stamps(5, 1.0)
+    one = dvl(ns, [0.8, 0.0, 0.0])
+    other = dvl(ns, [0.81, 0.0, 0.0])
+    within = dvl(np.repeat(ns, 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1)))
     across = odometry_at_rest(one)
-    inside = odometry_at_rest(within)
     assert across.add(None, other)
-    for odometry in (across, inside):
-        np.testing.assert_array_equal(odometry.rows()[3], one.stamps_ns)
+    for odometry in (across, odometry_at_rest(within)):
+        np.testing.assert_array_equal(odometry.rows()[3], ns)
         np.testing.assert_array_equal(odometry.rows()[4], one.velocity)
 
 
@@ -107,14 +106,17 @@ def test_rows_are_turned_into_body_axes_with_known_noise():
     """A sensor whose x axis points along the body's y, and whose y along the body's -x."""
     quarter = Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))
     log = DvlCalibration(mounting=quarter, velocity_sigma_m_s=(0.01, 0.02, 0.03))
+    turned = np.array([-2.0, 1.0, 3.0])
     for cov in (np.diag([1e-4, 4e-4, 9e-4]), np.nan):
         intake = RowIntake(Calibration(imu=ImuCalibration(mounting=quarter), dvl=log))
-        intake.add_imu(imu(stamps(5, 0.2), [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]))
+        intake.add_imu(imu(stamps(5, 0.2), [1.0, 2.0, 3.0], [2.0, 4.0, 6.0]))
         intake.add_dvl(dvl(stamps(5, 0.2), [0.1, 0.2, 0.3], cov))
-        assert intake.imu.values[0][1] == pytest.approx([-2.0, 1.0, 3.0])
-        assert intake.imu.values[1][1] == pytest.approx([-5.0, 4.0, 6.0])
-        assert intake.dvl.values[0][1] == pytest.approx([-0.2, 0.1, 0.3])
-        assert intake.dvl.values[1][1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
+        rate, force = intake.imu.values
+        velocity, noise, *_ = intake.dvl.values
+        assert np.array([rate[1], force[1] / 2, 10 * velocity[1]]) == pytest.approx(
+            np.tile(turned, (3, 1))
+        )
+        assert noise[1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
 
 
 def test_an_infinite_variance_is_a_direction_not_measured():

@@ -185,7 +185,7 @@ def test_sigma_is_the_textbooks_between_grid_points_too(offset_s):
 
 
 @pytest.mark.parametrize("valley_s", [0.02, 0.11])
-def test_a_hollow_in_a_valley_has_the_sigma_of_the_valley(valley_s: float):
+def test_a_hollow_in_a_valley_has_the_sigma_of_the_valley(valley_s):
     """Offsets nearby that fit nearly as well widen it; what the other parameters owe to the offset grows alike."""
     P = np.array([[0.03**2, 0.02 * 0.03**2], [0.02 * 0.03**2, 0.05**2]])
     hollow = OffsetFit(LeastSquaresFit(np.zeros(2), P, 1.0, 1.0, RATIOS), 0.0, "")

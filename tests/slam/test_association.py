@@ -61,9 +61,7 @@ NO_IDENTITY = Outcome.NO_IDENTITY
         "once a frame, of equals the first",
     ],
 )
-def test_the_most_probable_identity_is_accepted(
-    rows: tuple, least: float, ids: list[int], refusals: list
-) -> None:
+def test_the_most_probable_identity_is_accepted(rows, least, ids, refusals):
     found, outcomes = identify(stated(*rows), least)
     assert found.tolist() == ids
     assert outcomes.tolist() == [
@@ -83,9 +81,7 @@ def test_the_most_probable_identity_is_accepted(
         ([0.0, 0.0], NO_LANDMARK),
     ],
 )
-def test_what_reaches_the_least_probability_is_decided(
-    belief: list[float], decided: int
-) -> None:
+def test_what_reaches_the_least_probability_is_decided(belief, decided):
     assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
 
 
@@ -170,7 +166,7 @@ def brute_force(case: Innovations) -> tuple[int, float, tuple[int, ...]]:
     n=st.integers(1, 4),
     spread=st.sampled_from([0.5, 1.5, 4.0]),
 )
-def test_the_pairing_is_that_of_trying_all(seed: int, m: int, n: int, spread: float):
+def test_the_pairing_is_that_of_trying_all(seed, m, n, spread):
     case = random_case(seed, m, n, spread)
     found = pair_jointly(case, PROBABILITY)
     size, squared, landmarks = brute_force(case)

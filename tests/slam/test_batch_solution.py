@@ -98,7 +98,7 @@ def seen(*sightings: np.ndarray) -> Sightlines:
 
 @pytest.mark.parametrize("wrong", [4, 6])
 def test_a_few_wrong_first_sightings_do_not_hold_a_landmark(
-    wrong: int,
+    wrong,
 ):
     """By a kernel that saturates, and twelve right sightings 40 m away; the same ones without a kernel need no help."""
     rng = np.random.default_rng(wrong)

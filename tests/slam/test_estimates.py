@@ -28,8 +28,8 @@ BIAS = 1e-3 * np.arange(-5.0, 6.0) + some_motion(1, 5e-3).bias
 
 @pytest.mark.parametrize("bias_key", [None, B(0)], ids=["no bias", "bias"])
 def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(
-    bias_key: int | None,
-) -> None:
+    bias_key,
+):
     """``J P J'`` with J by differences, P joint of keyframe and bias: what both share counts."""
     moved = some_motion(1, 5e-3)
     P = random_covariance(17, 0.01, 3)
@@ -135,9 +135,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("asked", "said"), REFUSED, ids=str)
-def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(
-    asked: dict, said: str
-):
+def test_a_covariance_that_cannot_be_is_refused_with_what_is_known(asked, said):
     estimator = ran(5.0, "bounded" if asked.get("over") == "history" else "whole")
     is_joint = asked.keys() & {"landmarks", "keyframes", "stamps_ns"}
     with pytest.raises(EstimatorError, match=f"^isam2: {said}") as caught:
@@ -161,9 +159,7 @@ def test_names_of_landmarks_without_names_are_refused_where_these_begin():
 
 @pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture"])
 @pytest.mark.parametrize("range_m", [1.1e5, 1e200])
-def test_a_range_beyond_any_sonar_is_refused_and_changes_nothing(
-    policy: str, range_m: float
-):
+def test_a_range_beyond_any_sonar_is_refused_and_changes_nothing(policy, range_m):
     sequence, _ = rail(8)
     seen = sequence.detections
     far = seen.range_m.copy()

@@ -1,6 +1,6 @@
 """Factors: errors in closed form, derivatives by differences, information by directions."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import gtsam
 import numpy as np
@@ -170,9 +170,9 @@ def fixes_over_gaps(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
 def test_derivatives_are_those_of_differences(
-    made_at: Callable[[gtsam.Pose3, np.random.Generator], Made],
-    pose: gtsam.Pose3,
-    seed: int,
+    made_at,
+    pose,
+    seed,
 ):
     for factor, values in made_at(pose, np.random.default_rng(seed)):
         check_jacobians(factor, values)

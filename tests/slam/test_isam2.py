@@ -168,9 +168,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("given", "fault"), REFUSED.values(), ids=REFUSED)
-def test_what_a_policy_does_not_read_is_refused_by_name(
-    given: dict[str, Any], fault: str
-) -> None:
+def test_what_a_policy_does_not_read_is_refused_by_name(given, fault):
     with pytest.raises(EstimatorError) as refused:
         make_params(Isam2, given, "isam2")
     assert fault in str(refused.value)

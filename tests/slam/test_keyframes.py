@@ -239,7 +239,7 @@ def shares(keyframes: Keyframes, at_s: list[float]) -> list[float]:
     ],
     ids=["each gap anew", "a gap that has ended before a frame"],
 )
-def test_frames_between_gaps_tell_all(at_s: list[float], told: list[float]):
+def test_frames_between_gaps_tell_all(at_s, told):
     """With bottom lock, or only so long after it that velocity still counts as linear, frames share no such error.
 
     The end of a gap is a node, even where that is no keyframe.

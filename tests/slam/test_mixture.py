@@ -10,7 +10,6 @@ from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
-from sonar_graph.models import Kernel
 from sonar_graph.slam import GaussianKernel, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.mixture import (
@@ -106,14 +105,14 @@ def of_nothing(seen: TrackedObject) -> float:
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
-def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
+def test_a_kernels_density_integrates_to_one(kernel):
     e = np.sinh(np.linspace(-18.0, 18.0, 400_001))  # as far as Cauchy's tails matter
     assert trapezoid(
         np.exp(kernel.log_normaliser - kernel.loss(e)), e
     ) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_new_detections_components_are_predictive_densities() -> None:
+def test_a_new_detections_components_are_predictive_densities():
     """Of three landmarks, one of them across the cut of the azimuth; of one that is not in the graph, and of none."""
     rng = np.random.default_rng(2)
     A = rng.standard_normal((3, 2, 2))
@@ -133,7 +132,7 @@ def test_a_new_detections_components_are_predictive_densities() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
+def test_the_best_choices_are_the_most_probable_of_all(seed):
     """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""
     values = world()
     rng = np.random.default_rng(seed)
@@ -186,9 +185,7 @@ def vote(watches: list[TrackedObject], point: Floats) -> float:
     ("here", "there"), [(6, 2), (6, 5), (4, 4), (2, 6), (1, 3), (0, 2)]
 )
 @pytest.mark.parametrize("strays", [0, 1, 3])
-def test_the_place_with_most_votes_wins_whatever_lies_far_off(
-    here: int, there: int, strays: int
-) -> None:
+def test_the_place_with_most_votes_wins_whatever_lies_far_off(here, there, strays):
     """What fits nowhere has no voice, however far off it is; summed errors would be drawn to it."""
     values = world()
     far = [HERE + np.array([0.0, 1.2 + 0.5 * k, 0.0]) for k in range(strays)]

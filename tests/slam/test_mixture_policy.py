@@ -85,16 +85,14 @@ def worst_landmark_m(world: Dive) -> float:
 
 
 @pytest.mark.parametrize("kernel", [GaussianKernel(), RobustKernel()])
-def test_wrong_names_cost_nothing_and_accepting_them_does(kernel: Kernel) -> None:
+def test_wrong_names_cost_nothing_and_accepting_them_does(kernel):
     right_m = worst_landmark_m(misnamed("robust", share=0.0)[0])
     assert worst_landmark_m(misnamed("max-mixture", kernel)[0]) < right_m + 0.02
     assert worst_landmark_m(misnamed("robust")[0]) > right_m + 0.1
 
 
 @pytest.mark.parametrize("can_move", [True, False])
-def test_a_landmark_that_begins_in_a_wrong_place_is_moved(
-    can_move: bool, monkeypatch
-) -> None:
+def test_a_landmark_that_begins_in_a_wrong_place_is_moved(can_move, monkeypatch):
     if not can_move:
         monkeypatch.setattr(
             doubtful_identities, "supporters_elsewhere", lambda *_: None
@@ -110,7 +108,7 @@ def test_a_landmark_that_begins_in_a_wrong_place_is_moved(
     assert world.outcomes.count(Outcome.UNFIT) == (1 if can_move else 6)
 
 
-def test_a_misnamed_landmark_gets_its_name_with_all_sightings() -> None:
+def test_a_misnamed_landmark_gets_its_name_with_all_sightings():
     """A landmark 4 that nothing else was seen of becomes 9 when its track is named so."""
     world = dive("max-mixture")
     rng = np.random.default_rng(2)

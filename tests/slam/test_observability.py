@@ -37,7 +37,7 @@ def along(direction: list[float], sigma: float) -> gtsam.NonlinearFactor:
     return gtsam.CustomFactor(isotropic(1, sigma), [L(1)], error)
 
 
-def test_a_range_leaves_open_what_is_across_it() -> None:
+def test_a_range_leaves_open_what_is_across_it():
     """Of the landmark when the pose is known; weak information counts as missing."""
     distance = gtsam.RangeFactor3D(X(0), L(1), 2.0, isotropic(1, 0.1))
     (across,) = left_open(graph_of([distance]), HERE, [L(1)])

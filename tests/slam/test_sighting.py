@@ -29,7 +29,7 @@ POINT = np.array([3.0, 0.5, -1.7])
 @pytest.mark.parametrize(
     "floor", [None, FloorPrior(z_m=-1.7, sigma_m=0.02)], ids=["no floor", "floor"]
 )
-def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
+def test_a_point_is_that_of_least_squares(floor):
     """With the elevation at the first sighting, or the floor, as a prior; to a tenth of a sigma.
 
     Poses are on an arc, at different heights, and look at the point.

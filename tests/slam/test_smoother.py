@@ -20,13 +20,11 @@ from .fed import (
     FOREVER_S,
     NEVER_M,
     SONAR,
-    Fed,
     assert_is_least_squares,
     in_the_basin,
     on_the_rail,
     ranged,
 )
-from .graphs import block_of, off_sigmas
 from .made import (
     counted,
     graph_of,
@@ -46,24 +44,6 @@ NODES = 21
 END_S = (NODES - 1) * STEP_S
 
 _, NUMBERS = rail(NODES)
-
-
-@pytest.mark.parametrize("lag_s", [FOREVER_S, 1.1], ids=["in the window", "not in it"])
-def test_a_joint_covariance_of_any_poses_is_that_of_all_factors(lag_s):
-    fed = in_the_basin(15, lag_s)
-    values, _ = fed.smoother.solve_history()
-    keys = [X(2), X(9), L(5)]
-    found = block_of(fed.smoother.joint_covariance_of_any(keys), keys)
-    assert off_sigmas(found, fed.dense(values, *keys)) < 1e-2
-
-
-def assert_all_is_least_squares(
-    fed: Fed, numbers: Rail, landmarks: tuple[int, ...] = (4, 7)
-) -> None:
-    """The window, and the beginning of the history."""
-    assert_is_least_squares(fed, numbers, NODES, landmarks)
-    x1 = fed.smoother.solve_history()[0].atPose3(X(1)).translation()[0]
-    assert x1 == pytest.approx(numbers.solution(NODES)[0]["x1"], abs=1e-8)
 
 
 def with_ranges(gone: list[tuple[int, int]], *new: tuple[int, int, float]) -> Rail:
@@ -113,24 +93,6 @@ def test_after_an_exchange_the_estimate_is_that_of_what_is_left(monkeypatch, giv
     assert solved or not gives_up
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
-
-
-def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
-    fed = on_the_rail(NODES, 2.6)
-    gone = [(k, 7) for k in range(1, NODES)]
-    removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
-    fed.smoother.exchange(END_S, removed, lost_landmarks=[L(7)])
-    assert_all_is_least_squares(fed, with_ranges(gone), (4,))
-    assert not fed.smoother.values.exists(L(7))
-    (distance,) = (r for k, i, r in NUMBERS.ranges if (k, i) == (NODES - 1, 7))
-    point = (
-        fed.smoother.values.atPose3(X(NODES - 1)).translation()
-        + distance * np.eye(3)[0]
-    )
-    fed.smoother.exchange(
-        END_S, (), [FactorGroup(ranged(NODES - 1, 7, distance, 3e-4))], {L(7): point}
-    )
-    assert_all_is_least_squares(fed, with_ranges(gone[:-1]))
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.1])

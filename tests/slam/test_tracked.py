@@ -38,9 +38,7 @@ from .rail import STEP_S, rail
 
 @pytest.mark.parametrize("lag_s", [15.0, 2.0])
 @pytest.mark.parametrize("trouble", TROUBLES)
-def test_late_identities_give_the_graph_of_identities_known_at_once(
-    trouble: str, lag_s: float
-):
+def test_late_identities_give_the_graph_of_identities_known_at_once(trouble, lag_s):
     """Without a gyro bias no factor depends on an estimate: equal one by one, and so are the marginals."""
     sequence = simulate_basin(
         BasinOptions(**BASIN, **TROUBLES[trouble], gyro_bias_scale=0.0)
@@ -143,7 +141,7 @@ def answers(
 
 
 @pytest.mark.parametrize("policy", CUT)
-def test_no_bit_depends_on_how_a_log_is_cut_into_calls_or_on_questions(policy: str):
+def test_no_bit_depends_on_how_a_log_is_cut_into_calls_or_on_questions(policy):
     seldom = answers(policy, None)
     assert len(seldom.estimates) > 10
     assert unlike(seldom, answers(policy, 1)) == []
@@ -200,37 +198,30 @@ def said(tracks: list[int], beliefs: list[list[float]]) -> Sequence:
 
 @pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture"])
 @settings(max_examples=4, phases=[Phase.explicit, Phase.generate])
-@given(data=st.data())
-def test_a_run_is_that_without_second_rows_of_tracks(policy: str, data: st.DataObject):
-    tracks = data.draw(st.lists(st.integers(NO_TRACK, 1), min_size=ROWS, max_size=ROWS))
-    beliefs = data.draw(
-        st.lists(
-            st.sampled_from(BELIEFS_OF_REPEATED_TRACKS), min_size=ROWS, max_size=ROWS
-        )
-    )
+@given(
+    st.lists(st.integers(NO_TRACK, 1), min_size=ROWS, max_size=ROWS),
+    st.lists(st.sampled_from(BELIEFS_OF_REPEATED_TRACKS), min_size=ROWS, max_size=ROWS),
+)
+def test_a_run_is_that_without_second_rows_of_tracks(policy, tracks, beliefs):
     sequence = said(tracks, beliefs)
-    estimator = run(
-        sequence, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy]
-    )
-    outcomes = assert_outcomes_account(estimator, sequence)
-    is_kept = np.array(
-        [
-            outcome is not Outcome.TRACK_REPEATED
-            for outcome in estimator.detections().outcomes
-        ]
-    )
-    pairs = enumerate(zip(sequence.detections.stamps_ns.tolist(), tracks, strict=True))
+    seen = sequence.detections
+    of_policy = {"keyframes__motion_noise_share": 0.0} | POLICIES[policy]
+    estimator = run(sequence, 1 / STEP_S, **of_policy)
+    outcomes = estimator.detections().outcomes
+    is_kept = np.array([why is not Outcome.TRACK_REPEATED for why in outcomes])
     may_be_used = {
         (stamp_ns, track if track != NO_TRACK else -2 - row)
-        for row, (stamp_ns, track) in pairs
+        for row, (stamp_ns, track) in enumerate(
+            zip(seen.stamps_ns, tracks, strict=True)
+        )
     }
-    assert outcomes[Outcome.TRACK_REPEATED] == ROWS - len(may_be_used)
-    without = replace(sequence, detections=sequence.detections.rows(is_kept))
-    alone = run(
-        without, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy]
-    )
+    assert len(outcomes) == ROWS
+    assert is_kept.sum() == len(may_be_used)
+    without = replace(sequence, detections=seen.rows(is_kept))
+    alone = run(without, 1 / STEP_S, **of_policy)
     assert np.array_equal(estimator.landmarks().ids, alone.landmarks().ids)
-    assert np.array_equal(estimator.landmarks().positions, alone.landmarks().positions)
-    assert np.array_equal(
-        estimator.trajectory().positions, alone.trajectory().positions
-    )
+    for one, other in (
+        (estimator.landmarks(), alone.landmarks()),
+        (estimator.trajectory(), alone.trajectory()),
+    ):
+        assert np.array_equal(one.positions, other.positions)

@@ -161,7 +161,7 @@ def named_late(sequence: Sequence | None = None, share: float = 0.4) -> Sequence
 
 
 @pytest.mark.parametrize(("history", "lag_s"), [("whole", 12.0), ("bounded", 3.0)])
-def test_what_waits_leaves_with_its_keyframe(history: str, lag_s: float):
+def test_what_waits_leaves_with_its_keyframe(history, lag_s):
     """False detections of a first part, without names, wait when the second begins, in which landmarks are merged."""
     sequence = named_late(
         simulate_basin(
@@ -182,7 +182,7 @@ def test_what_waits_leaves_with_its_keyframe(history: str, lag_s: float):
 
 @pytest.mark.parametrize("lag_s", [15.0, 2.0])
 def test_a_landmark_named_later_gives_the_graph_of_one_known_at_once(
-    lag_s: float,
+    lag_s,
 ):
     """Factor by factor, and so are the marginals."""
     estimator = run(named_late(), **ASSOCIATED, smoother__lag_s=lag_s)
@@ -237,9 +237,7 @@ def anonymous(
 
 @pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
 @pytest.mark.parametrize("share", [0.99, 1.01])
-def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(
-    range_m: float, share: float
-) -> None:
+def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(range_m, share):
     """So many a square metre are ``range`` times as many a metre of range and radian of azimuth."""
     z = np.array([range_m + 0.02, 0.01])
     _, smoother = anonymous(range_m, 1.0)
@@ -285,7 +283,7 @@ def one_of_two(
 
 @pytest.mark.parametrize("name", [5, FIRST_ANONYMOUS_ID + 1])
 @pytest.mark.parametrize("own_sigma", [0.05, 1.0])
-def test_two_are_one_within_the_gate_where_they_are_dense(own_sigma: float, name: int):
+def test_two_are_one_within_the_gate_where_they_are_dense(own_sigma, name):
     """``P_aa + P_bb - P_ab - P_ba`` and the noise of a sighting: what both share does not count."""
     variance = 2 * own_sigma**2 + NOISE_M**2
     reach_m = math.sqrt(chi2.ppf(PROBABILITY, 3) * variance)
@@ -310,9 +308,7 @@ def test_the_only_landmark_without_a_name_is_merged():
 
 @pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
 @pytest.mark.parametrize("share", [0.98, 1.02])
-def test_a_candidate_known_to_a_tenth_of_its_range_begins_a_landmark(
-    range_m: float, share: float
-) -> None:
+def test_a_candidate_known_to_a_tenth_of_its_range_begins_a_landmark(range_m, share):
     """One sighting in an aperture whose standard deviation is about 0.1 rad."""
     made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
     sighting = Sighting(
