@@ -105,24 +105,19 @@ def test_the_cache_goes_where_numba_is_told_and_needs_no_compiler(loops):
 CALLER = """
 from callee import inner
 from limits import LIMIT
+from sonar_graph.numerics.matrices import compiled
 
-{imported}
-
-{decorator}
+@compiled
 def outer(x):
     return 10.0 * inner(x) + LIMIT
 """
 CALLEE = """
-{imported}
+from sonar_graph.numerics.matrices import {kind}
 
-{decorator}
+@{kind}
 def inner(x):
     return x + {offset}
 """
-CHECKED = {
-    "imported": "from sonar_graph.numerics.matrices import compiled",
-    "decorator": "@compiled",
-}
 Ask = Callable[..., tuple[float, int]]
 
 
@@ -134,14 +129,14 @@ def ask(monkeypatch) -> Ask:
 
     def ask(
         folder: Path,
-        how: dict[str, str] = CHECKED,
         offset: float = 1.0,
         limit: float = 0.0,
+        kind: str = "compiled",
     ) -> tuple[float, int]:
         texts = (
             f"LIMIT = {limit}\n",
-            CALLEE.format(**how, offset=offset),
-            CALLER.format(**how),
+            CALLEE.format(kind=kind, offset=offset),
+            CALLER,
         )
         for name, text in zip(names, texts, strict=True):
             sys.modules.pop(name, None)
@@ -180,3 +175,10 @@ def test_cached_code_is_used_until_what_it_was_compiled_from_changes(ask, tmp_pa
         39.0,
         1,
     )
+
+
+@pytest.mark.parametrize("kind", ["inlined", "compilable"])
+def test_cached_code_sees_changes_of_what_python_runs_elsewhere(ask, tmp_path, kind):
+    assert ask(tmp_path / "it", kind=kind)[0] == 20.0
+    assert ask(tmp_path / "it", kind=kind) == (20.0, 0)
+    assert ask(tmp_path / "it", kind=kind, offset=2.5)[0] == 35.0

@@ -127,6 +127,7 @@ LENGTHS = {
     "km": 1e3,
 }
 PRESSURES = {"kPa as Pa": 1e3, "hPa as Pa": 1e2, "dbar as Pa": 1e4, "bar as Pa": 1e5}
+ANOTHER_UNIT = "another unit"
 KNOTS = "knots of the Doppler log"
 KNOTS_LINE = f"`scale = 0.5144` under [dvl] {IN_LOG_CONFIG}"
 MINUTES = "degrees and minutes written as 12.3456"
@@ -656,7 +657,7 @@ class SensorComparison:
                 "sensor or its driver",
                 unused(check.role),
             )
-        unit = units[0] if units else "another unit"
+        unit = units[0] if units else ANOTHER_UNIT
         times = 1.0 / check.units.get(unit, 1.0 / size)
         line = check.other_lines.get(unit)
         line = line or scale_line(check.role, check.scale_key, self.config, times)

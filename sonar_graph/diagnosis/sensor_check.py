@@ -392,6 +392,9 @@ class SensorCheck:
         ]
         self.join_vertical_bias()
         self.doubt_arm()
+        # sensors that are wrong by others do not fit a right truth either
+        if any(f.grave for f in [*self.of_dvl, *self.by_motion]):
+            self.reference = []
         self.reference += reference_findings(right, self.config, tilt)
         start = right.calibration.start
         if start.states("rpy_rad"):

@@ -14,6 +14,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, KnownMap
 from sonar_graph.diagnosis.aiding_check import (
+    ANOTHER_UNIT,
     DEPTH,
     FAULTS,
     HEADING,
@@ -87,6 +88,7 @@ UPSIDE_DOWN_RAD = np.radians(150.0)
 WILD_SIGMAS = 10.0
 DELAY = ": delay"
 OWN_WORLD = "where the truth has a world of its own, as of a motion capture, read the aligned errors"
+OR_PATH = "where the truth is right, the Doppler log or the gyros are wrong"
 ORIENTATION_LINE = (
     "quaternions are x, y, z, w, of the body in the world, not of the world in the body; `orientation = false` under "
     f"[truth] {IN_LOG_CONFIG} leaves them out"
@@ -198,7 +200,6 @@ PATH = replace(
         f'{other_world(config, "truth")}, and `rotation = "frd"` where its orientations are of a body with z down; or the '
         "fields of position in another order",
     ),
-    causes=(),
 )
 HEIGHT = replace(
     DEPTH,
@@ -265,17 +266,24 @@ def faults_of(one: SensorComparison | None) -> list[Finding]:
     """The first of the faults that hide each other; nothing without any."""
     if one is None:
         return []
+    is_path = one.check is PATH
     # only a path shows another time, since ways there and back turn alike
     finds = [
         find
         for find in FAULTS
-        if one.check is PATH or find is not SensorComparison.of_other_clock
+        if is_path or find is not SensorComparison.of_other_clock
     ]
-    fault = next(filter(None, (find(one) for find in finds)), None)
-    if fault is None:
+    # beside a path that a current takes away a right truth looks stuck
+    fault = (is_path and one.of_cause()) or next(
+        filter(None, (find(one) for find in finds)), None
+    )
+    if not fault:
         return []
-    if one.check is ORIENTATION and fault.line.startswith(unused("truth")):
-        fault = replace(fault, line=ORIENTATION_LINE)
+    is_open = fault.line.startswith(unused("truth")) or ANOTHER_UNIT in fault.cause
+    if is_open and one.check is ORIENTATION:
+        return [replace(fault, line=ORIENTATION_LINE)]
+    if is_open and is_path:
+        return [replace(fault, line=f"{fault.line}; {OR_PATH}")]
     return [fault]
 
 

@@ -74,6 +74,8 @@ def inlined(function: Compiled) -> Compiled:
 
 def compilable(function: Compiled) -> Compiled:
     """Leave a function to Python, where arrays of any kind need no compilation; compiled functions can call it too."""
+    assert isinstance(function, FunctionType)
+    COMPILED_IN[function.__module__] += 1
     return cast(Compiled, extending.register_jitable(**OPTIONS)(function))
 
 

@@ -74,7 +74,8 @@ def test_images_are_moved_to_the_clock_of_the_navigation(lane, both, tmp_path, r
 @pytest.fixture(scope="module")
 def few(lane, tmp_path_factory) -> Path:
     """Too few images to measure an offset by."""
-    stamps_ns, images = lane.frames.stamps_ns[:12], lane.frames.intensity[:12]
+    stamps_ns = lane.frames.stamps_ns[:12]
+    images = lane.frames.intensity[:12]
     frames = replace(lane.frames, stamps_ns=stamps_ns, intensity=images)
     log = tmp_path_factory.mktemp("few") / "images.mcap"
     return images_log(replace(lane, frames=frames), log)

@@ -15,7 +15,15 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import Trajectory
 
-from .runs import grave, level_vehicle, names, started
+from .runs import (
+    compass,
+    grave,
+    level_vehicle,
+    names,
+    spoilt,
+    started,
+    true_yaw,
+)
 
 BASIN = simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1))
 UNKNOWN = replace(BASIN, truth=None)
@@ -138,6 +146,26 @@ def test_a_long_way_is_compared_with_another_clock_too():
     late = replace(run.truth, stamps_ns=run.truth.stamps_ns + 37 * NS_PER_S)
     (found,) = grave(replace(run, truth=late))
     assert found.estimate.value == pytest.approx(37.0, abs=0.1)
+
+
+def test_a_doppler_log_over_moving_water_is_not_the_truths_fault():
+    t = np.arange(0.0, 240.0, 0.02)
+    run = driven(np.full_like(t, 0.5), 0.15 * np.sin(0.1 * t))
+    yaw_rad = true_yaw(run)[::2]
+    water = 0.2 * np.column_stack([np.cos(yaw_rad), -np.sin(yaw_rad), 0.0 * yaw_rad])
+    drifting = spoilt(run, "dvl", velocity=run.dvl.velocity + water)
+    (found,) = grave(drifting)
+    assert found.quantity == "reference: current"
+    assert "bottom track under [dvl]" in found.line
+
+
+def test_wrong_gyros_that_a_compass_shows_are_not_the_truths_fault():
+    t = np.arange(0.0, 240.0, 0.02)
+    run = compass(driven(np.full_like(t, 0.5), 0.15 * np.sin(0.1 * t)))
+    fast = spoilt(run, "imu", angular_velocity=1.5 * run.imu.angular_velocity)
+    found = grave(fast)
+    assert found
+    assert not any(one.quantity.startswith("reference") for one in found)
 
 
 def test_orientations_of_another_time_are_orientations_of_something_else():

@@ -51,7 +51,8 @@ def plain(lane, tmp_path_factory) -> Recognition:
 def test_two_windows_in_turn_are_both_used(lane, log, plain):
     frames = frames_of(lane)
     for k in range(1, COUNT, 2):
-        image, ranges_m = frames[k].intensity, frames[k].ranges_m
+        image = frames[k].intensity
+        ranges_m = frames[k].ranges_m
         cropped = {"intensity": image[:, :, :450], "ranges_m": ranges_m[:450]}
         frames[k] = replace(frames[k], **cropped)
     found = recognised(lane, log, frames)

@@ -134,7 +134,8 @@ def test_likeness_is_the_correlation_of_successive_sightings_of_a_landmark():
     wider = sightings(0.8)
     wider.innovation_covs[:] *= np.linspace(1, 9, 2000)[:, None, None]
     in_sigmas = wider.innovations[:, 0] / np.sqrt(wider.innovation_covs[:, 0, 0])
-    a, b = in_sigmas[:-2], in_sigmas[2:]
+    a = in_sigmas[:-2]
+    b = in_sigmas[2:]
     expected_rho = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
     assert consistency.likeness(wider).correlation[0] == pytest.approx(expected_rho)
     # sightings that are 2.2 s apart are no pairs, and what was refused is no sighting

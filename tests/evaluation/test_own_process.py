@@ -91,7 +91,8 @@ def state() -> tuple[object, ...]:
 
 
 def test_an_estimator_cannot_change_another_s_process(plugin, mission):
-    first, second = "dead-reckoning", "ekf-slam"
+    first = "dead-reckoning"
+    second = "ekf-slam"
     alone = compare(mission, [first, second])
     before = state()
     together = compare(mission, [first, "their-meddling", second])

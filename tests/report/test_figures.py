@@ -175,7 +175,8 @@ def test_nothing_overlaps_and_nothing_leaves_the_figure(comparison, draw):
             continue
         texts = [text for text in panel.get_yticklabels() if text.get_text()]
         numbers = [text.get_window_extent() for text in texts]
-        low, high = panel.bbox.y0, panel.bbox.y1
+        low = panel.bbox.y0
+        high = panel.bbox.y1
         numbers = [one for one in numbers if low <= (one.y0 + one.y1) / 2 <= high]
         assert numbers
         label = panel.yaxis.label

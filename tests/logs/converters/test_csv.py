@@ -34,7 +34,9 @@ def columns_of(s, frd: bool) -> dict:
 
     seen = s.detections
     known = s.true_landmarks
-    azimuth, yaw, turns = seen.azimuth_rad, s.heading.yaw_rad, s.truth.quaternions_xyzw
+    azimuth = seen.azimuth_rad
+    yaw = s.heading.yaw_rad
+    turns = s.truth.quaternions_xyzw
     if frd:
         azimuth = -np.degrees(azimuth)
         yaw = np.degrees(np.pi / 2 - yaw)
