@@ -13,6 +13,7 @@ import pytest
 from numba.core import event
 
 from sonar_graph.numerics import compiling
+from sonar_graph.numerics.matrices import COMPILED_IN
 from sonar_graph.sonar.cfar import interpolated
 
 KERNELS = """
@@ -140,6 +141,7 @@ def ask(monkeypatch) -> Ask:
         )
         for name, text in zip(names, texts, strict=True):
             sys.modules.pop(name, None)
+            COMPILED_IN.pop(name, None)
             folder.mkdir(exist_ok=True)
             if (
                 not (folder / f"{name}.py").exists()
